@@ -47,8 +47,8 @@ class CaptureResult(AcceptanceResult):
 def play(live: Live, *, modes: Sequence[int]) -> list[ProbeResponse]:
     """Add shapes of each mode to the mirror in closed loop, in steps of growing amplitude, until one is not corrected.
 
-    Each shape is ramped up and down at half the slew limit: if that takes few frames, it equals closing the loop on a
-    static error. After a shape that was not corrected, the command is reset to zero.
+    Each shape is ramped up and down at half the slew limit. If a ramp takes few frames, the trial is equivalent to
+    closing the loop on a static error. After a shape that was not corrected, the command is reset to zero.
     """
     plan = [trials for noll in selected_modes(modes, live.loop.noll) if (trials := _trials(live, noll))]
     live.expect(sum(len(table) for trials in plan for _, table, _ in trials))

@@ -26,7 +26,7 @@ from lowfc.programs.commissioning.acceptance.probe import (
 from lowfc.programs.commissioning.calibrate.recording import await_mirror
 
 ATTEMPTS = 3
-"""Largest number of plays of a probe sequence that mirror or camera interrupt; then the test ends with an error."""
+"""Attempts to play a probe sequence; if mirror or camera interrupt each of them, the test ends with an error."""
 _OTHER_BYTES = 1000  # bytes of a request to play, without its table and shapes
 _LAW_FIELDS = ("gain", "leak", "limit_nm", "law", "calibration_id")
 
@@ -105,7 +105,7 @@ class Live:
         """Play a table and return the loop's response; without shapes in `basis` the table is added to the offset.
 
         A table without columns adds no probe: only the steps are recorded. AcceptanceError if the table is too large
-        for a request, gains or law changed, or the mirror or the camera interrupted `ATTEMPTS` plays.
+        for a request, gains or law changed, or the mirror or the camera interrupted all `ATTEMPTS` plays.
         """
         self.check_length(frames := len(table), table.shape[1], basis)
         self.set_mode(mode)

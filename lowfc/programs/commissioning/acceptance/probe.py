@@ -117,6 +117,7 @@ class ProbeResponse:
 
     Attributes:
         parameters: parameters of the test, from the announcing note.
+        loop: the measured loop; its frame rate is that of these frames.
         target: what the probe was added to, `mirror` or `offset`; empty without a probe.
         table: probe amplitudes (frames, columns); (frames, 0) without a probe.
         error_nm: modal error (frames, modes); NaN where a frame is missing or was refused.
@@ -193,14 +194,14 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
         limited = sequence[(sequence >= first) & (history.steps.reasons & _LIMIT_BITS != 0)].tolist()
         end = min([first + frames, *limited[:1]])  # a limit that acts ends the measurement
         _check_undisturbed(history, first, end, play=play)
-        cut = 0 if limited else first + frames - 1 - int(sequence.max(initial=first - 1))
-        if cut > MAX_MISSING * frames:
+        absent = 0 if limited else first + frames - 1 - int(sequence.max(initial=first - 1))
+        if absent > MAX_MISSING * frames:
             named = [f"{key} {parameters[key]}" for key in ("noll", "level_nm", "loop") if key in parameters]
             raise DataFileError(
-                f"{path}: ends {cut} of {frames} frames before the end of a measurement ({', '.join([kind, *named])}): "
-                "give all files of the log, or measure again"
+                f"{path}: ends {absent} of {frames} frames before the end of a measurement "
+                f"({', '.join([kind, *named])}): give all files of the log, or measure again"
             )
-        request_ns = from_timestamp(request.timestamp)  # states are selected by time: one after a `clear` has no frame
+        request_ns = from_timestamp(request.timestamp)  # select states by time: a state after `clear` has no frame
         states = [state for state in history.controllers if len(state.gain) == modes]
         before = [state for state in states if from_timestamp(state.timestamp) <= request_ns]
         if not before:
@@ -246,7 +247,7 @@ def _announced(requests: Sequence[wire.Request], kind: Kind) -> list[tuple[dict[
 
 
 def _parameters(note: str, kind: Kind) -> dict[str, Any] | None:
-    """The parameters that a note announces; None if it announces another test or none, as an operator's own note."""
+    """The parameters of a test that a note announces; None for a note of another test, or of an operator."""
     try:
         parameters = json.loads(note.removeprefix(ANNOUNCEMENT))
     except (ValueError, RecursionError):

@@ -20,14 +20,14 @@ STORED_IMAGES = 50
 
 
 class FrameRecord(NamedTuple):
-    """A frame without its pixels; `put_ns` is 0 without a valid envelope, `highest` (DN) None if the size is wrong."""
+    """A frame without pixels. Without a valid envelope `publish_time_ns` is 0; if the size is wrong `highest_dn` is None."""
 
     receive_time_ns: int
-    put_ns: int
+    publish_time_ns: int
     image: RawImage
-    size: int
+    data_bytes: int
     checksum: int
-    highest: int | None
+    highest_dn: int | None
 
     @property
     def time_ns(self) -> int:
@@ -63,7 +63,7 @@ class Camera(CollectedMessages):
         """Store a message for the checks, frames without their pixels."""
         if message.key == FRAME.key:
             try:
-                self._frame(message, RawImage.FromString(message.payload))
+                self._store_frame(message, RawImage.FromString(message.payload))
             except DecodeError:
                 self.unreadable += 1
             message = message._replace(payload=b"")
@@ -74,16 +74,17 @@ class Camera(CollectedMessages):
                 self.states.append(None)
         super().store(message)
 
-    def _frame(self, message: Received, image: RawImage) -> None:
-        data, envelope, highest = image.data, message.envelope, None
+    def _store_frame(self, message: Received, image: RawImage) -> None:
+        data, envelope, highest_dn = image.data, message.envelope, None
         if image.step == 2 * image.width and len(data) == image.step * image.height > 0:
             pixels = np.frombuffer(data, "<u2").reshape(image.height, image.width)
-            highest = int(pixels.max())
+            highest_dn = int(pixels.max())
             if len(self.pixels) < STORED_IMAGES:
                 self.pixels.append(pixels)
         image.ClearField("data")
-        put_ns = 0 if envelope is None else envelope.publish_time_ns
-        self.frames.append(FrameRecord(message.receive_time_ns, put_ns, image, len(data), zlib.crc32(data), highest))
+        publish_time_ns, checksum = 0 if envelope is None else envelope.publish_time_ns, zlib.crc32(data)
+        frame = FrameRecord(message.receive_time_ns, publish_time_ns, image, len(data), checksum, highest_dn)
+        self.frames.append(frame)
 
     @property
     def settings(self) -> wire.CameraState | None:
@@ -98,21 +99,22 @@ class Camera(CollectedMessages):
     @cached_property
     def brightest_dn(self) -> int:
         """The brightest pixel of all frames, DN."""
-        return max((frame.highest or 0 for frame in self.frames), default=0)
+        return max((frame.highest_dn or 0 for frame in self.frames), default=0)
 
     @cached_property
-    def put_times_ns(self) -> list[int]:
+    def publish_times_ns(self) -> list[int]:
         """Publish times of the frames, or their arrival times if any publish time is implausible."""
-        puts, arrivals = [frame.put_ns for frame in self.frames], [frame.receive_time_ns for frame in self.frames]
-        near = all(abs(arrival - put) <= LATE_NS for put, arrival in zip(puts, arrivals, strict=True))
-        return puts if near and all(later > earlier for earlier, later in pairwise(puts)) else arrivals
+        times = [frame.publish_time_ns for frame in self.frames]
+        arrivals = [frame.receive_time_ns for frame in self.frames]
+        near = all(abs(arrival - time) <= LATE_NS for time, arrival in zip(times, arrivals, strict=True))
+        return times if near and all(later > earlier for earlier, later in pairwise(times)) else arrivals
 
 
-def watch(connection: Connection, seconds: float, advance: Callable[[float], None]) -> Camera:
-    """Observe a camera for `seconds`; `advance` is called with the elapsed time."""
+def watch(connection: Connection, seconds: float, progress: Callable[[float], None]) -> Camera:
+    """Observe a camera for `seconds`; `progress` receives the elapsed time, s."""
     camera, begun_ns = Camera(connection), connection.now_ns()
     while (elapsed_s := (connection.now_ns() - begun_ns) / NS) < seconds:
-        advance(elapsed_s)
+        progress(elapsed_s)
         camera.collect(min(POLL_S, seconds - elapsed_s))
     camera.seconds = seconds
     camera.answers = connection.ask(CAMERA_STATE.key)

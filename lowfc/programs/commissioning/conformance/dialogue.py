@@ -188,8 +188,8 @@ class Dialogue(CollectedMessages):
             while self.connection.now_ns() < sent_ns + ANSWER_S * NS:
                 self.collect(POLL_S)
                 for message, state in self.states[before:]:
-                    if (put_ns := times_ns.get(state.frame_sequence)) is not None:
-                        return state, put_ns, message.receive_time_ns - put_ns
+                    if (command_ns := times_ns.get(state.frame_sequence)) is not None:
+                        return state, command_ns, message.receive_time_ns - command_ns
         return None, sent_ns, 0
 
     def go(self, surface_nm: Single) -> wire.MirrorState | None:

@@ -16,7 +16,7 @@ from lowfc.programs.commissioning.conformance.settings import SETTINGS
 
 _SILENT_PERIODS = 5  # longest wait between frames that is not reported, in frame periods
 _JITTER = 0.1  # largest deviation of 99 % of the waits that is not reported, in frame periods
-_SMOOTHER = 2.0  # ratio of roughness above which bytes count as swapped
+_SMOOTHER = 2.0  # roughness of an image relative to that with swapped bytes, above which its bytes count as swapped
 _READOUT_NS = 50_000_000  # longest plausible time from end of exposure to publication
 _FULL = 0.01  # fraction of the pixels above which saturated pixels are reported
 _STOPPED_NS = 300_000_000  # shorter silences, before the first frame and after the last together, do not count
@@ -66,7 +66,7 @@ def _frame_time(camera: Camera) -> Check:
     if back:
         got = f"{back} of {len(times) - 1} not later than the previous one"
         return wrong(got, "read the time for every exposure, from a clock that never steps")
-    age_ns = int(np.median(np.subtract(camera.put_times_ns, times)))
+    age_ns = int(np.median(np.subtract(camera.publish_times_ns, times)))
     exposure_ns = 0 if camera.settings is None else camera.settings.exposure_ns
     got = f"{age_ns / 1e6:.3g} ms before the publish time"
     if age_ns < -_AGE_NS:
@@ -92,16 +92,16 @@ def _encoding(camera: Camera) -> Check:
 
 @FRAMES.check("bytes", "step is 2 x width, and data are step x height bytes")
 def _bytes(camera: Camera) -> Check:
-    last = next((frame for frame in reversed(camera.frames) if frame.highest is None), None)
+    last = next((frame for frame in reversed(camera.frames) if frame.highest_dn is None), None)
     if last is None:
-        return ok(f"step {camera.frames[-1].image.step}, {camera.frames[-1].size} bytes")
+        return ok(f"step {camera.frames[-1].image.step}, {camera.frames[-1].data_bytes} bytes")
     rows, columns = last.shape
     advice = "send complete rows without padding, and set width and height accordingly"
-    if last.size == rows * columns:
+    if last.data_bytes == rows * columns:
         advice = "the pixels are bytes: send uint16"
-    elif last.size == 2 * rows * columns:
+    elif last.data_bytes == 2 * rows * columns:
         advice = "set step, in bytes"
-    return wrong(f"{rows} x {columns} (height x width), step {last.image.step}, {last.size} bytes", advice)
+    return wrong(f"{rows} x {columns} (height x width), step {last.image.step}, {last.data_bytes} bytes", advice)
 
 
 @FRAMES.check("shape", "the same rows and columns in every frame")
@@ -112,7 +112,7 @@ def _shape(camera: Camera) -> Check:
 
 @FRAMES.check("steadiness", "frames at a constant rate during the whole check")
 def _steadiness(camera: Camera) -> Check:
-    spans = np.diff(camera.put_times_ns)
+    spans = np.diff(camera.publish_times_ns)
     if not spans.size:
         return warning("one frame", "use a longer --duration")
     period_ns = float(np.median(spans))
@@ -123,13 +123,13 @@ def _steadiness(camera: Camera) -> Check:
         return wrong(got, "the camera must publish whether or not a process subscribes; repeat while it is running")
     late_ns, longest_ns = float(np.percentile(np.abs(spans - period_ns), 99)), float(spans.max())
     got = (
-        f"every {period_ns / 1e6:.4g} ms, 99 % within {late_ns / 1e6:.3g} ms of it, "
+        f"every {period_ns / 1e6:.4g} ms, 99 % of the waits within {late_ns / 1e6:.3g} ms of that, "
         f"longest wait {longest_ns / 1e6:.3g} ms"
     )
     if longest_ns > max(_SILENT_PERIODS * period_ns, _OWN_WAIT_NS):
         return warning(got, "what delays the camera? Check the host with `lowfc doctor`")
     if late_ns > _JITTER * period_ns:
-        return warning(got, "jitter costs delay: use real-time scheduling for the publisher (`lowfc doctor`)")
+        return warning(got, "jitter adds to the delay: use real-time scheduling for the publisher (`lowfc doctor`)")
     return ok(got)
 
 

@@ -266,9 +266,9 @@ def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
         advice = "before any move, check shape, byte count, isfinite, and frame_sequence not below the last"
         yield judged(name, expected, not bad, "nothing changed", advice, got)
     state, _, _ = mirror.ask(base_nm)
-    if state is None or (mirror.failed and lost >= 4):  # after every invalid one: no stall of this host
+    if state is None or (mirror.failed and lost >= 4):  # lost after each invalid command: no stall of this host
         expected, advice = "valid commands are applied after invalid ones", "catch decoding errors, and continue"
-        got = "no more answers" if state is None else "the first one after each invalid one is lost"
+        got = "no more answers" if state is None else "the first valid command after each invalid one is lost"
         yield judged("after bad commands", expected, False, got, advice)
         return
     mirror.listen(_SETTLE_S)
@@ -380,7 +380,7 @@ def _reaches_stroke(mirror: Dialogue) -> bool:
 def _peak(moving: Mask) -> tuple[Single, tuple[int, list[int]]]:
     """A shape with one actuator at 0.5 and all others at -0.5; row and columns of this actuator and its two neighbours.
 
-    Of the actuators that move with both neighbours, it is the nearest to the centre; of all if none moves so.
+    This actuator is the nearest to the centre among those that move and whose two neighbours move, else among all.
     """
     good = np.zeros_like(moving)
     good[:, 1:-1] = moving[:, 1:-1] & moving[:, :-2] & moving[:, 2:]

@@ -15,7 +15,7 @@ from lowfc.programs.commissioning.conformance.connection import NS, CollectedMes
 LATE_NS = 20_000_000
 """Clock difference above which every frame of a camera with 100 Hz or more is refused as late by default."""
 
-_AHEAD_NS = 1_000_000
+_AHEAD_NS = 1_000_000  # time by which a message may appear to arrive before it was published
 _DECADE_S = 10 * 365 * 86_400
 _UNITS = {"microseconds": 1_000, "milliseconds": 1_000_000, "seconds": NS}
 
@@ -47,8 +47,8 @@ def _sequence(device: CollectedMessages) -> Check | None:
         return wrong(f"only a count ({sequences[-1]})", advice)
     if not now_s - _DECADE_S < start <= now_s + 1:
         swapped = int.from_bytes(sequences[-1].to_bytes(8, "little"), "big")
-        big = now_s - _DECADE_S < start_of(swapped) <= now_s + 1
-        advice = "write it little-endian" if big else "put the unix seconds of the publisher's start there"
+        big_endian = now_s - _DECADE_S < start_of(swapped) <= now_s + 1
+        advice = "write it little-endian" if big_endian else "put the unix seconds of the publisher's start there"
         return wrong(f"upper 32 bits {start}, present time {now_s}", advice)
     steps = [later - earlier for earlier, later in pairwise(sequences) if start_of(earlier) == start_of(later)]
     back, gaps = sum(step <= 0 for step in steps), [step - 1 for step in steps if step > 1]
@@ -67,7 +67,7 @@ def _sequence(device: CollectedMessages) -> Check | None:
 
 
 @PUBLISHER.check("publish time", "the host's clock just before publishing, increasing")
-def _put_time(device: CollectedMessages) -> Check | None:
+def _publish_time(device: CollectedMessages) -> Check | None:
     times = [envelope.publish_time_ns for envelope in device.envelopes]
     if not times:
         return None
