@@ -20,7 +20,7 @@ STORED_IMAGES = 50
 
 
 class FrameRecord(NamedTuple):
-    """A frame without pixels. Without a valid envelope `publish_time_ns` is 0; if the size is wrong `highest_dn` is None."""
+    """A frame without pixels; `publish_time_ns` is 0 without a valid envelope, `highest_dn` None with a wrong size."""
 
     receive_time_ns: int
     publish_time_ns: int
