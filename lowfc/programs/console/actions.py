@@ -42,8 +42,8 @@ class Action(NamedTuple):
 
     def command(self, values: Values, run: str) -> list[str]:
         """Arguments of `lowfc` for the task."""
-        given = {name: str(user_path(value)) for name, value in values.items() if value and name != LOAD}
-        options = [word for name, value in given.items() for word in (f"--{name}", value)]
+        filled = {name: str(user_path(value)) for name, value in values.items() if value and name != LOAD}
+        options = [word for name, value in filled.items() for word in (f"--{name}", value)]
         answer = values.get(LOAD, "").lower()
         if answer not in ("y", "yes", "n", "no", ""):
             raise ConfigurationError(f"load must be yes or no, got {answer!r}: write yes, y, no or n; empty means no")
@@ -89,7 +89,7 @@ _READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
     "law": ("law", _law),
     "calibration": ("calibration", _calibration),
 }
-"""For each field of a request: the client's argument, and the parser of the operator's text."""
+"""By field of a request: name of the argument of `Client.ask`, and parser of the operator's text."""
 _LABELS = {
     "modes": "modes: Noll indices as in 2,3 or 4-8; empty for all",
     "actuators": "shape: file (FITS or .npy), nm of surface; empty removes the channel",

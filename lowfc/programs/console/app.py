@@ -167,7 +167,7 @@ class Console(OrderedKeys):
     def action_mute(self) -> None:
         """Switch the bell off or on."""
         self._mute = not self._mute
-        self._answer(f"the bell is {'off' if self._mute else 'on'}", ok=True)
+        self._show_answer(f"the bell is {'off' if self._mute else 'on'}", ok=True)
 
     def action_help(self) -> None:
         """Show the keys."""
@@ -188,7 +188,7 @@ class Console(OrderedKeys):
 
         A request waits for the answer to the previous request of the same button; SAFE does not wait.
         """
-        self._answer(f"{action.name}: requested", ok=True)
+        self._show_answer(f"{action.name}: requested", ok=True)
         previous = self._requesting.get(action.name) if action is not SAFE else None
 
         def ask() -> None:
@@ -216,7 +216,7 @@ class Console(OrderedKeys):
         """Show the answer to an action, or why it failed; also in the form of the action, if it has one."""
         if self._torn_down:
             return
-        self._answer(text, ok=ok)
+        self._show_answer(text, ok=ok)
         self.query_one(f"#{_id(action)}").set_class(not ok, "refused")
         if action.name == "gain" and not ok:
             self.query_one(Gains).discard_pending()
@@ -226,7 +226,7 @@ class Console(OrderedKeys):
             else:
                 form.show_answer(text)
 
-    def _answer(self, text: str, *, ok: bool) -> None:
+    def _show_answer(self, text: str, *, ok: bool) -> None:
         answer = self._static("answer")
         answer.set_class(not ok, "refused")
         answer.update(text, layout=False)
@@ -278,7 +278,7 @@ class Console(OrderedKeys):
     def _watch_tasks(self) -> None:
         for task in [task for task in self._tasks if task.status is not None]:
             self._tasks.remove(task)
-            self._answer(task.status_line, ok=not task.status)
+            self._show_answer(task.status_line, ok=not task.status)
         self._static("tasks").display = bool(self._tasks)
         self._show_text("tasks", Text("\n".join(task.status_line for task in self._tasks)))
 

@@ -1,4 +1,4 @@
-"""Readings of the run, several times a second: the verdict of the view's tiles, and values."""
+"""Readings of the run, several times a second: verdict and tiles as in the view, and values."""
 
 import contextlib
 import threading

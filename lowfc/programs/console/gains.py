@@ -30,7 +30,7 @@ class Gains(Lines):
         """Make the knobs; `send` receives the modes of a knob and their new gains; no gains mean automatic ones."""
         super().__init__("gains")
         self._send = send
-        self._chosen = self._top = 0  # index of the chosen knob, and of the first one shown
+        self._chosen = self._top = 0  # index of the chosen knob, and of the first knob on the screen
         self._noll: tuple[int, ...] = ()
         self._gain = np.zeros(0, np.float32)
         self._automatic: Mask = np.zeros(0, bool)
@@ -45,12 +45,12 @@ class Gains(Lines):
         else:
             self._noll, self._gain = noll, np.array(state.gain, np.float32)
             self._automatic = np.array(state.automatic or [False] * len(state.gain), bool)
-            self._chosen = min(self._chosen, max(0, len(groups(noll)) - 1))
+            self._chosen = min(self._chosen, max(0, len(knobs(noll)) - 1))
         self._draw()
 
     def choose(self, by: int) -> None:
         """Choose the knob `by` lines below the present one."""
-        self._chosen = (self._chosen + by) % max(1, len(groups(self._noll)))
+        self._chosen = (self._chosen + by) % max(1, len(knobs(self._noll)))
         self._draw()
 
     def turn(self, steps: int) -> None:
@@ -63,7 +63,7 @@ class Gains(Lines):
     def automatic(self) -> None:
         """Request automatic gains for the chosen knob."""
         if self._noll:
-            self._send(groups(self._noll)[self._chosen][1], [])
+            self._send(knobs(self._noll)[self._chosen][1], [])
 
     def discard_pending(self) -> None:
         """Discard refused requests: the knobs return to the controller's gains."""
@@ -71,7 +71,7 @@ class Gains(Lines):
 
     def on_click(self, event: events.Click) -> None:
         """Choose a knob, and turn it to where its bar was clicked."""
-        if 0 <= event.y < len(groups(self._noll)) - self._top:
+        if 0 <= event.y < len(knobs(self._noll)) - self._top:
             self._chosen = self._top + event.y
             if _BAR_START <= event.x <= _BAR_START + _BAR:
                 self._request(self._chosen, (event.x - _BAR_START) / _BAR * HIGHEST)
@@ -82,10 +82,10 @@ class Gains(Lines):
         present = self._gain[self._indices(number)]
         gains = np.full(len(present), gain) if not present.any() else present / present.max() * gain
         self._pending[number] = gain, time.monotonic() + _PENDING_S
-        self._send(groups(self._noll)[number][1], [float(f"{value:.4g}") for value in gains.tolist()])
+        self._send(knobs(self._noll)[number][1], [float(f"{value:.4g}") for value in gains.tolist()])
 
     def _indices(self, number: int) -> list[int]:
-        return [self._noll.index(mode) for mode in groups(self._noll)[number][1]]
+        return [self._noll.index(mode) for mode in knobs(self._noll)[number][1]]
 
     def _shown_gain(self, number: int) -> float:
         gain, until_s = self._pending.get(number, (0.0, 0.0))
@@ -93,7 +93,7 @@ class Gains(Lines):
 
     def _draw(self) -> None:
         lines = []
-        for number, (name, _) in enumerate(groups(self._noll)):
+        for number, (name, _) in enumerate(knobs(self._noll)):
             gain, indices = self._shown_gain(number), self._indices(number)
             filled = round(min(max(gain / HIGHEST, 0.0), 1.0) * _BAR)
             lowest = float(self._gain[indices].min())
@@ -114,7 +114,7 @@ class Gains(Lines):
         self.show(lines[self._top :] or [Text("gains are not known yet", DIM)])
 
 
-def groups(noll: Sequence[int]) -> list[tuple[str, tuple[int, ...]]]:
+def knobs(noll: Sequence[int]) -> list[tuple[str, tuple[int, ...]]]:
     """Name and modes of each knob: all modes, then those of each radial order."""
     orders: dict[int, list[int]] = {}
     for mode in noll:

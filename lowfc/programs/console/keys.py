@@ -18,7 +18,8 @@ class OrderedKeys(App[str]):
     """An application in which a form opened by a key receives the next keys, however fast they arrive.
 
     Textual sends a key to the widget that has the focus when it arrives, even if the previous key is about to move the
-    focus. Over a slow line several keys arrive at once: a form would lose its first letters, and Tab would be too late.
+    focus. Over a slow line several keys arrive at once: a form would lose its first letters, and Tab would act too
+    late.
     """
 
     def __init__(self) -> None:
@@ -49,7 +50,7 @@ class OrderedKeys(App[str]):
             self.set_timer(_TIMEOUT_S, partial(self._next_key, self._turn))
 
     def _follow(self, node: DOMNode, turn: int) -> None:
-        """Follow the key from `node` up through its parents: queue a call behind it in each; then call `_settle`."""
+        """In `node` and each of its parents, queue a call behind the key; behind the last of them, call `_settle`."""
         if node is self or not node.call_later(self._follow, node.parent or self, turn):
             self.call_later(self._settle, turn)
 

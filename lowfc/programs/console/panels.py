@@ -150,7 +150,7 @@ def modes(reading: Reading, width: int) -> list[Text]:
 def _mode(noll: int, command_nm: float, limit_nm: float, width: int) -> Text:
     numbers_text = f"{command_nm:+6.1f}/{limit_nm:.0f}" if width >= 22 else ""
     half = max(1, (width - 4 - 11 * bool(numbers_text)) // 2)
-    share = abs(command_nm) / limit_nm if abs(command_nm) < limit_nm else 1.0  # a NaN from outside fills the bar
+    share = abs(command_nm) / limit_nm if abs(command_nm) < limit_nm else 1.0  # a received NaN fills the bar
     bar = "█" * round(share * half)
     left, right = (f"{bar:>{half}}", " " * half) if command_nm < 0 else (" " * half, f"{bar:{half}}")
     ink = WRONG if share >= _NEAR_LIMIT else style(ORANGE)
