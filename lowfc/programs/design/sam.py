@@ -32,8 +32,8 @@ from lowfc.programs.design.sam_request import Search
 STATE_PERIOD_S = 10.0
 """Shortest time between two writes of the state file."""
 _PUPIL_SAMPLES = 256
-"""One sample per cell of the package's shaped pupil. Predictions agree with those at 512 samples to 4e-4, predictions
-of contrast to 2 %."""
+"""One sample per cell of the package's shaped pupil. Predictions agree with those at 512 samples to a relative 4e-4,
+predictions of contrast to 2 %."""
 _NOTHING = "no chain had finished its first steps: nothing was found, nothing is written"
 
 
@@ -90,7 +90,7 @@ def design_sam(
                 raise LowfcError(f"the workers were lost ({error!r}); {advice}") from error
             raise
     points = [found_layout(search, chain) for chain in chains if chain.step]
-    best = front(points) if search.sweeps else [min(points, key=lambda point: point.merit)]
+    best = front(points) if search.has_front else [min(points, key=lambda point: point.merit)]
     command = command_line("lowfc design sam", search)
     write_layouts(out, best, search, command)
     if front_file is not None:
@@ -154,7 +154,7 @@ def advance_block(search: Search, chain: Chain, pupil: str) -> Chain:
 def found_layout(search: Search, chain: Chain) -> FoundLayout:
     """The best layout of a chain, with its predictions."""
     best = holes(chain.best, search.bounds.symmetry)
-    name = f"{search.name}_{chain.index}" if search.sweeps else search.name
+    name = f"{search.name}_{chain.index}" if search.has_front else search.name
     goal = search.goal_of(chain.index)
     weight = "" if goal.weight is None else f" with weight {goal.weight:g}"
     masks = " and ".join(search.focal_masks)

@@ -54,7 +54,7 @@ class Search:
         if self.focal_mask not in (*FOCAL_MASKS, "both"):
             raise ValueError(f"--focal-mask must be {', '.join(FOCAL_MASKS)} or both, got {self.focal_mask!r}")
         if not self.name or not all(letter.isalnum() or letter in "_-" for letter in self.name):
-            raise ValueError(f"--name must be of letters, digits, _ and -, got {self.name!r}")
+            raise ValueError(f"--name must consist of letters, digits, _ and -, got {self.name!r}")
         for option, value in {"chains": self.chains, "steps": self.steps}.items():
             if value < 1:
                 raise ValueError(f"{option} must be at least 1, got {value}")
@@ -63,7 +63,7 @@ class Search:
         _ = self.goal, self.bounds  # validated here
         if len(self.focal_masks) > 1 and not for_paper:
             raise ValueError(f"the merit {self.merit!r} uses one focal-plane mask; only 'paper' uses both")
-        if self.sweeps and self.chains < 2:
+        if self.has_front and self.chains < 2:
             raise ValueError("a front needs at least 2 chains, one for each weight; or set --weight")
 
     @cached_property
@@ -84,13 +84,13 @@ class Search:
         return Bounds(holes, diameter, gap, edge, self.symmetry)
 
     @property
-    def sweeps(self) -> bool:
-        """Whether the chains have different weights, along a front."""
+    def has_front(self) -> bool:
+        """Whether the chains have different weights and search for a front."""
         return self.merit == "pareto" and self.weight is None
 
     def goal_of(self, index: int) -> Goal:
         """The goal of chain `index`; along a front each chain has its own weight."""
-        return replace(self.goal, weight=index / (self.chains - 1)) if self.sweeps else self.goal
+        return replace(self.goal, weight=index / (self.chains - 1)) if self.has_front else self.goal
 
 
 def _span(option: str, text: str, scale: int) -> tuple[int, int]:
