@@ -23,7 +23,7 @@ from lowfc.control.loop.inputs import Frame, Load, Outputs, Request
 from lowfc.control.loop.requests import prepared
 from lowfc.control.loop.safety import Limit, Limits, Rejection
 from lowfc.control.loop.state import State
-from lowfc.programs.core.start_up import settings_under
+from lowfc.programs.core.start_up import settings_at_start
 from tests.support import toy
 
 RATE_HZ = 1000.0
@@ -228,7 +228,7 @@ def test_the_kernel_in_use_is_reported_by_an_event_and_is_numpy_if_the_fused_ste
     if isinstance(fault, ImportError):
         monkeypatch.setattr("importlib.import_module", Mock(side_effect=fault))
     event, config = Mock(), load(None, {"realtime.kernel": "fused"})
-    kernel = settings_under(Latch([tmp_path / "latch"]), config, event).kernel
+    kernel = settings_at_start(Latch([tmp_path / "latch"]), config, event).kernel
     if advice is None:
         assert kernel.name == FUSED
         event.assert_called_once_with("KERNEL", kernel=FUSED)

@@ -54,7 +54,7 @@ from lowfc.programs.core.controller_report import (
 )
 from lowfc.programs.core.gain_watch import GainWatch
 from lowfc.programs.core.mirror_reports import MirrorReports
-from lowfc.programs.core.start_up import StartUp, settings_under
+from lowfc.programs.core.start_up import StartUp, settings_at_start
 
 MIRROR_PATIENCE_S = 1.0
 """Longest time that the start waits for the mirror to report its shape."""
@@ -68,11 +68,11 @@ class Controller:
     def __init__(
         self, config: Configuration, service: Service, calibration: Calibration | None, source: str, latch: Latch
     ) -> None:
-        """Join the bus; load the calibration (None: idle), in events named `source`. LowfcError: a file is invalid."""
+        """Join the bus; load the calibration (None: idle), which events name `source`. LowfcError: a file is invalid."""
         name = config.mirror.name
         self._service = service
         self._latch = latch
-        self._settings = settings_under(latch, config, service.event)
+        self._settings = settings_at_start(latch, config, service.event)
         self._configuration = config.to_toml()
         self._start_up, self._start_pending = StartUp(config), True
         self._gain_watch = GainWatch(self._settings, config.control.on_harm, contrast_of(config).form)
@@ -340,7 +340,7 @@ class Controller:
             self._apply_report(MirrorReport(self._service.clock.now_ns(), fault, self._mirror.last()))
 
     def _send_start_requests(self) -> None:
-        """Request the configured shapes and law like an operator, once the mirror is known and no camera awaited."""
+        """Request the configured shapes and law like an operator, once the mirror is known and no camera is awaited."""
         state = self._state
         if state.loop is None or state.conditions.camera_awaited or not (self._start_pending and state.may_command):
             return

@@ -16,7 +16,7 @@ from lowfc.control.loop.state import ActiveLoop, Settings, State, Weighting
 from lowfc.control.loop.wording import AUTO
 
 FIRST_S = 2.0
-"""Length of the first window, all modes."""
+"""Length of the first window of frames from which gains are computed: all modes."""
 TILT_S, OTHERS_S = 1.0, 10.0
 """Length of later windows: tip and tilt, other modes."""
 FLUX_S = 0.25
@@ -24,7 +24,7 @@ FLUX_S = 0.25
 STAR_STEP = 0.2
 """Relative change of the flux, in two consecutive averages, above which the star counts as another one."""
 HARMFUL_WINDOWS = 3
-"""Number of windows in a row in which an open loop would have had a smaller residual, after which it is reported."""
+"""Number of windows in a row in which an open loop would have had a smaller residual, after which harm is reported."""
 CAUTIOUS_GAIN = 0.05
 """Highest gain of modes other than tip and tilt after their first window, in which tip and tilt may be uncorrected.
 
@@ -212,6 +212,7 @@ class GainWatch:
         return Actions((request,), events)
 
     def _judge(self, judged: list[_Group], step: Step, state: State, loop: ActiveLoop) -> Actions:
+        """Requests and events from the newest blocks of frames of these groups."""
         noise_nm2 = self._noise_nm2(loop) if any(group.bank.complete for group in judged) else None
         gain, initial, events = loop.integrator.gain.copy(), False, []
         for group in judged:

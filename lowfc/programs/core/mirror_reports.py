@@ -1,4 +1,4 @@
-"""The mirror's first shape, and its faults from its Health: receiving all states would cost time in every frame."""
+"""The mirror's first shape, and its faults; these are read from its Health, because all its states would cost time."""
 
 import contextlib
 from collections import deque

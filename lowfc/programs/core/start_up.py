@@ -65,7 +65,7 @@ def _configured_law(config: Configuration) -> LinearLaw | None:
     return linear_law
 
 
-def settings_under(latch: Latch, config: Configuration, event: Callable[..., None]) -> Settings:
+def settings_at_start(latch: Latch, config: Configuration, event: Callable[..., None]) -> Settings:
     """The settings of a configuration with its kernel loaded; the loop starts in safe mode if the latch is set.
 
     If the latch cannot be stored, the loop starts open and stays open until an operator closes it. An event reports a

@@ -22,7 +22,7 @@ _RECENT_S = 2.5
 """Span of the recent wavefront statistics, plus the delay of their report."""
 _EVENTS_SHOWN = 4
 _LEAST = {"p99": 100, "p99_9": 1000}
-"""Least number of durations for which a percentile is shown: of fewer, it would be the largest."""
+"""Least number of durations for which a percentile is shown: with fewer, it would be the largest duration."""
 _STYLES: dict[int, str] = {Level.WARNING: "yellow", Level.ERROR: "red", Level.FATAL: "bold red"}
 
 
@@ -80,7 +80,7 @@ def _rate(live: str, rate_hz: float, lockstep_hz: float | None) -> str:
 
 
 def _closed_for(controller: wire.Health, rate_hz: float) -> str:
-    """Text of how long the loop was closed in total, if less than the span of the residual's statistics; else empty."""
+    """Text of how long the loop was closed in total; empty unless shorter than the span of the residual statistics."""
     frames = topic_count(controller, FRAME.key).received
     closed_s = frames / rate_hz - controller.not_closed_ns * 1e-9 if rate_hz else 0.0
     just_closed = controller.mode == wire.LOOP_MODE_CLOSED and 0 < closed_s < _RECENT_S

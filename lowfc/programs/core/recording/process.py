@@ -55,7 +55,7 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
     )
     clock = clock_of(config)
     origin = {**provenance(run.run_id, config.seed), "clock_ahead_ms": f"{clock.ahead_ns() / 1e6:.3f}"}
-    with contextlib.closing(ZenohBus(run.links, Role.RECORDER, clock)) as bus, contextlib.ExitStack() as held:
+    with contextlib.closing(ZenohBus(run.links, Role.RECORDER, clock)) as bus, contextlib.ExitStack() as cleanup:
         recorder = Recorder(
             bus,
             clock,
@@ -76,7 +76,7 @@ def record(run: Run, config: Configuration, calibration: Path | None, shared: by
         if recorder_section.on_event:
             level = Level[recorder_section.on_event_level.upper()]
             alarm = Alarm(recorder.service, recorder_section.on_event, level, recorder_section.on_event_every_s)
-            held.callback(alarm.close)
+            cleanup.callback(alarm.close)
         return recorder.run()
 
 

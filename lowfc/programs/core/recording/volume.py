@@ -17,11 +17,11 @@ _FLOAT_BYTES, _PIXEL_BYTES = 4, 2
 _SURFACE_SIDE = 64  # pixels of the published image of the mirror's surface
 _MESSAGE_BYTES = 110  # times, sequence, flags, record header and index entry of a message
 _COMPRESSED_FRACTION = {FRAME: 0.6, COMMAND: 0.9, MIRROR_STATE: 0.55}
-"""Relative size of a payload after LZ4, measured in closed loop with the simulated camera at V = 2; otherwise 1."""
+"""Relative size of a payload after LZ4, measured in closed loop with the simulated camera at V = 2; other topics: 1."""
 
 
 def payload_bytes(config: Configuration, camera: wire.CameraState | None = None) -> dict[Topic, int]:
-    """Uncompressed arrays of one message, bytes, for each topic with large arrays.
+    """Size of the uncompressed arrays of one message, bytes, for each topic with large arrays.
 
     Without the camera's state, frames are those of the simulated camera.
     """
