@@ -68,7 +68,7 @@ class Controller:
     def __init__(
         self, config: Configuration, service: Service, calibration: Calibration | None, source: str, latch: Latch
     ) -> None:
-        """Join the bus; load the calibration (None: idle), which events name `source`. LowfcError: a file is invalid."""
+        """Join the bus; load the calibration (None: idle), named `source` in events. LowfcError: a file is invalid."""
         name = config.mirror.name
         self._service = service
         self._latch = latch
