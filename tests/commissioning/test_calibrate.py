@@ -316,7 +316,7 @@ def test_ctrl_c_restores_the_mirror_and_keeps_the_completed_cycles() -> None:
     _, data = measure(loop, "hadamard", resume=True)
     assert data.measured.cycles == 4
     assert np.array_equal(loop.surfaces_nm[-1], before_nm)
-    with pytest.raises(DataFileError, match="method is hadamard in the file, now poke"):
+    with pytest.raises(DataFileError, match="method is hadamard in the file, but poke now"):
         measure(loop, "poke", resume=True)
     with pytest.raises(DataFileError, match="nothing to resume"):
         measure(loop, "poke", out=Path("other.fits"), resume=True)
