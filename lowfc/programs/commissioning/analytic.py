@@ -24,13 +24,13 @@ WavefrontFunction = Callable[[Twin, TwinMirror], Array]
 """Computes the wavefront at the used nodes, nm, from a twin and the mirror on its nodes."""
 
 
-def analytic(config: Configuration, console: Console, at: WavefrontFunction | None = None) -> Calibration:
+def analytic(config: Configuration, console: Console, zero_point: WavefrontFunction | None = None) -> Calibration:
     """Compute I0, H and R, the paper's eqs. (6) to (12); raises the errors of `factory.analytic_calibration`.
 
     Args:
         config: Configuration of the instrument.
         console: Terminal for the progress bar and warnings.
-        at: Computes the wavefront of the zero point; flat if None.
+        zero_point: Computes the wavefront of the zero point; flat if None.
     """
 
     def warn(text: str) -> None:
@@ -39,7 +39,9 @@ def analytic(config: Configuration, console: Console, at: WavefrontFunction | No
     with counting_bar(console, TimeElapsedColumn()) as count:
         optics = factory.twin(config, lambda done, total: count("building the optical model", done, total), warn)
     on_nodes = factory.mirror_on_twin(config, optics, lambda _: None)
-    calibration = factory.analytic_calibration(config, optics, on_nodes, None if at is None else at(optics, on_nodes))
+    calibration = factory.analytic_calibration(
+        config, optics, on_nodes, None if zero_point is None else zero_point(optics, on_nodes)
+    )
     noise_nm = factory.frame_noise_nm(config, calibration)
     limit_nm = factory.settings(config).integrator(calibration.noll).limit_nm
     worst = int(np.argmax(noise_nm - limit_nm))

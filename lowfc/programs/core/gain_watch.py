@@ -108,7 +108,7 @@ class GainWatch:
             return NOTHING
         self._newest = newest
         same_camera = newest >> COUNT_BITS == before >> COUNT_BITS
-        held = newest - before - 1 if same_camera and newest > before else 1  # `clear` may lower the sequence
+        missing = newest - before - 1 if same_camera and newest > before else 1  # `clear` may lower the sequence
         channels = loop.command_channels
         playing = channels is not None and channels.play is not None
         if (
@@ -118,10 +118,10 @@ class GainWatch:
             or playing
             or state.mode not in (LoopMode.OPEN, LoopMode.CLOSED)
         ):
-            self._hold(held + 1)
+            self._hold(missing + 1)
             return NOTHING
-        if held:
-            self._hold(held)
+        if missing:
+            self._hold(missing)
         open_nm = step.pol_nm if channels is None else step.pol_nm - channels.offset_nm
         closed = step.mode is LoopMode.CLOSED and not state.returning_to_zero
         flux_ratio = self._flux_change(step.flux_dn)
@@ -148,6 +148,7 @@ class GainWatch:
         return actions._replace(events=(*events, *actions.events))
 
     def _hold(self, frames: int) -> None:
+        """Advance the groups by frames without measurements."""
         for group in self._groups:
             group.bank.held(frames)
 

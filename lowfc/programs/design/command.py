@@ -46,7 +46,9 @@ def spc(
 def sam(
     search: Search,
     context: typer.Context,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes, at most --chains. Default: all cores.")] = None,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Number of processes, at most --chains. Default: one per core.")
+    ] = None,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, to use its workers.")] = None,
     out: Annotated[Path | None, typer.Option(help="Layout file (.json). Default: the layout's name.")] = None,
     resume: Annotated[Path | None, typer.Option(help="State file of an interrupted search to continue.")] = None,

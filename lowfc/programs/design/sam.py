@@ -122,7 +122,7 @@ def _store_or_remove(state: Path, search: Search, pupil: str, chains: list[Chain
 
 
 def run_chains(search: Search, chains: list[Chain], executor: Executor, on_block: Callable[[], None]) -> None:
-    """Advance every chain to its end, in place, block by block."""
+    """Advance every chain to its end, in place, block by block; call `on_block` after each block."""
     running: dict[Future[Chain], int] = {}
     pupil = pupil_digest()
     try:

@@ -140,6 +140,7 @@ def _view(run: Run, show: Show, console: Console) -> Child:
 def _supervise(
     config: Configuration, children: list[Child], watch: Watch, console: Console, duration_s: float | None
 ) -> None:
+    """Show the status until the camera ends or a signal arrives, then stop all; ProcessDiedError if a process died."""
     camera = children[0]
     view = next((child for child in children if child.name == Role.VIEWER), None)
     display = (

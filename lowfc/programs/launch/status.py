@@ -21,7 +21,7 @@ SILENT_S = 2.0
 _RECENT_S = 2.5
 """Span of the recent wavefront statistics, plus the delay of their report."""
 _EVENTS_SHOWN = 4
-_LEAST = {"p99": 100, "p99_9": 1000}
+_MIN_DURATIONS = {"p99": 100, "p99_9": 1000}
 """Least number of durations for which a percentile is shown: with fewer, it would be the largest duration."""
 _STYLES: dict[int, str] = {Level.WARNING: "yellow", Level.ERROR: "red", Level.FATAL: "bold red"}
 
@@ -182,7 +182,7 @@ def summary_text(results: dict[str, Any], lockstep_hz: float | None = None) -> s
     def percentiles(values: dict[str, float], count: int) -> str:
         if not values["max"]:
             return "-"
-        shown = {name: value for name, value in values.items() if count >= _LEAST.get(name, 1)}
+        shown = {name: value for name, value in values.items() if count >= _MIN_DURATIONS.get(name, 1)}
         return "   ".join(f"{name.replace('_', '.')} {value:.0f} us" for name, value in shown.items())
 
     live = f"{results['rate_hz']:.1f} Hz" if results["rate_hz"] else "-"

@@ -111,17 +111,17 @@ def judge(trials: Sequence[ProbeResponse], configuration: Configuration) -> Capt
         trial_of_level = {trial.parameters["level_nm"]: trial for trial in trials if trial.parameters["noll"] == noll}
         converged = {level_nm: shape_removed(trial) for level_nm, trial in trial_of_level.items()}
         lost = [abs(level_nm) for level_nm, success in converged.items() if not success]
-        good = [level for level in converged if 0 < level < min(lost, default=np.inf) and -level in converged]
+        converging_nm = [level for level in converged if 0 < level < min(lost, default=np.inf) and -level in converged]
         required_nm = _required_nm(configuration, noll)
         modes.append(
             CaptureMode(
                 noll=noll,
                 name=mode_name(noll),
                 required_nm=required_nm,
-                captured_nm=max(good, default=0.0),
+                captured_nm=max(converging_nm, default=0.0),
                 lost_nm=min(lost, default=None),
                 limits=sorted({name for trial in trial_of_level.values() for name in trial.limits_hit}),
-                passed=max(good, default=0.0) >= required_nm * (1 - 1e-6),
+                passed=max(converging_nm, default=0.0) >= required_nm * (1 - 1e-6),
             )
         )
     return CaptureResult(test=KIND, passed=all(mode.passed for mode in modes), trials=len(trials), modes=modes)

@@ -26,7 +26,7 @@ conformance_app = new_app(
 )
 
 RunName = Annotated[
-    str | None, typer.Option("--run", help="Name of the run; default: the only one with such a device.")
+    str | None, typer.Option("--run", help="Name of the run; default: the only run with such a device.")
 ]
 
 

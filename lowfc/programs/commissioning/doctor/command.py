@@ -63,7 +63,7 @@ def doctor(
             if undo:
                 done = permissions.undo(root)
             else:
-                done = permissions.apply(root, user) if apply else [permissions.shown(root)]
+                done = permissions.apply(root, user) if apply else [permissions.settings_text(root)]
         except (OSError, LookupError) as fault:  # such as a read-only folder, or a user unknown to usermod
             raise DataFileError(f"the settings cannot be changed completely: {fault}") from fault
         sys.stdout.write("\n".join(done) + "\n")

@@ -17,8 +17,8 @@ FILES = {"etc/security/limits.d/90-lowfc.conf": _LIMITS, "etc/udev/rules.d/90-lo
 """Contents by path below the root. The files of `deploy` have other names, so that --undo leaves them in place."""
 
 
-def shown(root: Path) -> str:
-    """Text of the files and commands."""
+def settings_text(root: Path) -> str:
+    """Text of the files, and of the commands that root has to run."""
     files = [f"# {root / name}\n{text}" for name, text in FILES.items()]
     user = os.environ.get("SUDO_USER") or os.environ.get("USER", "NAME")
     commands = f"groupadd --system --force {GROUP}\nusermod -aG {GROUP} {user}\n"
