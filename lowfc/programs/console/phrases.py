@@ -1,4 +1,4 @@
-"""The loop's sentences for the console: with its keys in place of commands, and ranges in place of long lists."""
+"""Sentences of the loop in the console: with keys in place of `lowfc` commands, and ranges in place of long lists."""
 
 import re
 

@@ -220,7 +220,7 @@ class Controller:
             self._camera.mailbox.wake()  # `run` does its other work now, then waits until the next warm-up is due
 
     def _warm_up(self) -> None:
-        """Repeat the last step and discard the result: other work evicts its code and data from the caches."""
+        """Repeat the last step and discard the result: other work evicts a step's code and data from the caches."""
         with self._lock:
             if self._last_sample is None or self._state.frame_sequence + 1 >= SEQUENCE_BOUND:
                 return

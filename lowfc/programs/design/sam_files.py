@@ -61,7 +61,7 @@ def write_state(path: Path, search: Search, pupil: str, chains: Sequence[Chain])
 
 
 def read_state(path: Path, pupil: str) -> tuple[Search, list[Chain]]:
-    """Read a search and chains from a file of `write_state`; DataFileError if it is not one, or is of another pupil."""
+    """Read the search and chains of a state file; DataFileError if it is not one, or belongs to another pupil."""
     try:
         state = json.loads(input_file.read_whole(path, _MAX_BYTES))
         search = Search(**state["search"])

@@ -26,7 +26,7 @@ from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrat
 MAX_NOISE_RATIO = 1.5
 """Largest accepted ratio of the noise of the measured R to that of the computed R, at the same flux. A sensor far from
 its zero point exceeds it."""
-_MAX_MODEL_ERROR = 0.5  # of an element of R H; a model with more is of another sensor or orientation
+_MAX_MODEL_ERROR = 0.5  # largest error of an element of R H if the model is of this sensor and orientation
 DELAY_TOLERANCE_FRAMES = 0.1
 """Largest difference between measured and configured delay without a warning, frames."""
 
@@ -293,8 +293,8 @@ def _actuators_to_modes(config: Configuration, in_use: Calibration, matrix: Arra
     A common factor between measurement and model, from the mirror's stroke or sign for example, also applies to other
     shapes. A negative factor is accepted only if focus or spherical is among the modes: a mirror of the opposite sign
     reverses all modes, but half a turn of most sensors reverses tip and tilt alone. If the sensor has another size or
-    orientation than the model, the result for other shapes is that of the calibration in use, or else that of their
-    projection onto the modal shapes.
+    orientation than the model, the result for other shapes is that of the calibration in use, if it has such a matrix;
+    otherwise other shapes are projected onto the modal shapes.
     """
     commands, previous = in_use.modes_to_actuators.astype(np.float64), in_use.actuators_to_modes.astype(np.float64)
     inverse, product = np.linalg.pinv(commands), matrix @ response  # R H is the identity unless R is regularised

@@ -23,7 +23,7 @@ VALID_NS = NS
 MODAL_NM = (0.5, -0.25)
 """Modal command of every test command."""
 CHANNEL = "lowfc"
-"""The controller's channel, so that its next command replaces the test's."""
+"""Channel of the controller, so that the first command of a later controller replaces the test's shape."""
 POLL_S = 0.002
 
 Show = Callable[[str], None]

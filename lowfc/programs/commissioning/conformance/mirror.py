@@ -64,7 +64,7 @@ def mirror_checks(mirror: Dialogue, seconds: float, show: Show, *, gentle: bool 
 
 
 def _with_failed_attempts(mirror: Dialogue, checks: Iterator[Check]) -> Iterator[Check]:
-    """Add to each check the number of its attempts that failed before."""
+    """Add to the result of each check the number of failed attempts before it."""
     for check in checks:
         failed, mirror.failed = mirror.failed, 0
         yield check._replace(got=f"{check.got} ({counted(failed, 'failed attempt')} before)") if failed else check
