@@ -215,13 +215,13 @@ class GainWatch:
     def _judge(self, judged: list[_Group], step: Step, state: State, loop: ActiveLoop) -> Actions:
         """Requests and events from the newest blocks of frames of these groups."""
         noise_nm2 = self._noise_nm2(loop) if any(group.bank.complete for group in judged) else None
-        gain, initial, events = loop.integrator.gain.copy(), False, []
+        gain, first_window, events = loop.integrator.gain.copy(), False, []
         for group in judged:
             if not group.bank.complete:
                 early = group.bank.early(loop.integrator.gain[group.mask])
                 gain[group.mask] = np.where(loop.automatic[group.mask], early, gain[group.mask])
                 continue
-            initial |= group.bank.first
+            first_window |= group.bank.first
             noise = None if noise_nm2 is None else noise_nm2[group.mask]
             group.gain = loop.integrator.gain[group.mask]
             group.verdict = verdict = group.bank.verdict(loop.integrator.gain[group.mask], noise)
@@ -232,7 +232,7 @@ class GainWatch:
                 group.bank.begin_first_window()
             events += self._harm_events(group, verdict, loop)
         requests, request = [], partial(Request, step.time_ns, requester=REQUESTER)
-        if loop.automatic.any() and (initial or not np.array_equal(gain, loop.integrator.gain)):
+        if loop.automatic.any() and (first_window or not np.array_equal(gain, loop.integrator.gain)):
             requests.append(self._gain_request(step, loop, gain))
         self.closing_harm = "" if state.mode is LoopMode.CLOSED else self._closing_harm(gain, loop)
         if state.waits_for_gains and all(group.verdict is not None for group in self._groups):
@@ -305,8 +305,8 @@ class GainWatch:
             for each in self._groups:
                 each.harmful_windows = 0
         noise_nm2 = self._noise_nm2(loop)
-        noise = 0.0 if noise_nm2 is None else float(noise_nm2[group.mask].sum())
-        open_nm2 = max(float(verdict.power_nm2.sum()) - noise, 0.0)
+        total_noise_nm2 = 0.0 if noise_nm2 is None else float(noise_nm2[group.mask].sum())
+        open_nm2 = max(float(verdict.power_nm2.sum()) - total_noise_nm2, 0.0)
         harmful = (verdict.loop_nm2 > 2 * verdict.loop_error_nm2) | (verdict.loop_nm2 == verdict.loop_nm2.max())
         noll = np.array(loop.calibration.noll)[group.mask]
         details: dict[str, object] = {

@@ -188,13 +188,13 @@ def _streams(loop: Client) -> Iterator[tuple[Iterator[Frame], Iterator[Step]]]:
             raise
 
 
-def _checked_mode(loop: Client, step: Step, before: LoopMode | None, *, ended: bool) -> LoopMode:
+def _checked_mode(loop: Client, step: Step, previous: LoopMode | None, *, ended: bool) -> LoopMode:
     """The mode of a step; raise if the probe sequence was stopped before it `ended`."""
-    if not ended and before is not None and step.mode is not before:
+    if not ended and previous is not None and step.mode is not previous:
         loop.check_lease()  # its error names who ended the lease
         raise CalibrationError(
-            f"the loop went from {before.name.lower()} to {step.mode.name.lower()} during the pokes, which ended them; "
-            "do not operate the loop during a calibration"
+            f"the loop went from {previous.name.lower()} to {step.mode.name.lower()} during the pokes, which ended "
+            "them; do not operate the loop during a calibration"
         )
     limits = [reason.name for reason in step.reasons if reason in _LIMITS]
     if limits and not ended:

@@ -23,7 +23,7 @@ from lowfc.programs.commissioning.conformance.settings import agreement_checks
 MAX_RATE_DIFFERENCE = 0.05
 """Largest relative difference between the rate from the frames' times and the rate in the camera's settings."""
 _MAX_BRIGHTNESS = 0.9  # of a good pixel, as a fraction of saturation
-_NS = 1e9
+_NS_PER_S = 1e9
 
 
 class Sensor(NamedTuple):
@@ -60,17 +60,16 @@ def checked_camera(
     if not (state.period_ns and period_ns > 0):
         faults.append(f"times: the camera's period_ns is {state.period_ns}, but its frames are {period_ns:g} ns apart")
     elif abs(period_ns / state.period_ns - 1) > MAX_RATE_DIFFERENCE:
-        faults.append(
-            f"rate: the camera reports {_NS / state.period_ns:.5g} Hz, its frames arrive at {_NS / period_ns:.5g} Hz"
-        )
+        reported_hz, measured_hz = _NS_PER_S / state.period_ns, _NS_PER_S / period_ns
+        faults.append(f"rate: the camera reports {reported_hz:.5g} Hz, its frames arrive at {measured_hz:.5g} Hz")
     if faults:
         raise CalibrationError("the camera cannot be used:\n" + "\n".join(f"  {fault}" for fault in faults))
     for check in checks:
         if check.status is Status.WARNING:
             report(f"remark: {check.name}: the camera has {check.got}, expected {check.expected}")
     report(
-        f"{state.rows} x {state.columns} pixels of {state.bit_depth} bits at {_NS / period_ns:.5g} Hz, brightest pixel "
-        f"{max(int(image.pixels.max()) for image in images)} of {state.saturation_dn:g} DN"
+        f"{state.rows} x {state.columns} pixels of {state.bit_depth} bits at {_NS_PER_S / period_ns:.5g} Hz, brightest "
+        f"pixel {max(int(image.pixels.max()) for image in images)} of {state.saturation_dn:g} DN"
     )
     return replace(camera_settings(state), start_s=0)
 

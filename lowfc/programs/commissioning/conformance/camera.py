@@ -11,7 +11,7 @@ from google.protobuf.message import DecodeError
 
 from lowfc.arrays import Pixels
 from lowfc.contract.messages import CAMERA_STATE, FRAME, RawImage, Role, from_timestamp, wire
-from lowfc.programs.commissioning.conformance.connection import NS, CollectedMessages, Connection, Received
+from lowfc.programs.commissioning.conformance.connection import NS_PER_S, CollectedMessages, Connection, Received
 from lowfc.programs.commissioning.conformance.publisher import LATE_NS
 
 POLL_S = 0.02
@@ -113,7 +113,7 @@ class Camera(CollectedMessages):
 def watch(connection: Connection, seconds: float, progress: Callable[[float], None]) -> Camera:
     """Observe a camera for `seconds`; `progress` receives the elapsed time, s."""
     camera, begun_ns = Camera(connection), connection.now_ns()
-    while (elapsed_s := (connection.now_ns() - begun_ns) / NS) < seconds:
+    while (elapsed_s := (connection.now_ns() - begun_ns) / NS_PER_S) < seconds:
         progress(elapsed_s)
         camera.collect(min(POLL_S, seconds - elapsed_s))
     camera.seconds = seconds

@@ -18,7 +18,7 @@ from lowfc.contract.envelope import Envelope, sequence_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, wire
 
-NS = 1_000_000_000
+NS_PER_S = 1_000_000_000
 EVERYTHING = "lowfc/**"
 _FAILURES = "DRIVER_FAILED", "DRIVER_HANGS"
 

@@ -12,13 +12,13 @@ from lowfc.arrays import Mask, Single
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import COMMAND, MIRROR_STATE, timestamp, wire
-from lowfc.programs.commissioning.conformance.connection import NS, CollectedMessages, Connection, Received
+from lowfc.programs.commissioning.conformance.connection import NS_PER_S, CollectedMessages, Connection, Received
 
 ANSWER_S = 0.5
 """Timeout for an answer; a slower mirror cannot be used in a loop."""
 ATTEMPTS = 3
 """Attempts before a check fails: a mirror skips commands that a stall of the host delayed."""
-VALID_NS = NS
+VALID_NS = NS_PER_S
 """Validity of an ordinary test command."""
 MODAL_NM = (0.5, -0.25)
 """Modal command of every test command."""
@@ -128,9 +128,9 @@ class Dialogue(CollectedMessages):
 
     def listen(self, seconds: float) -> list[wire.MirrorState]:
         """States received in the next `seconds`."""
-        before, end_ns = len(self.states), self.connection.now_ns() + round(seconds * NS)
+        before, end_ns = len(self.states), self.connection.now_ns() + round(seconds * NS_PER_S)
         while (remaining_ns := end_ns - self.connection.now_ns()) > 0:
-            self.collect(min(POLL_S, remaining_ns / NS))
+            self.collect(min(POLL_S, remaining_ns / NS_PER_S))
         return [state for _, state in self.states[before:]]
 
     def since(self, time_ns: int) -> list[tuple[Received, wire.MirrorState]]:
@@ -185,7 +185,7 @@ class Dialogue(CollectedMessages):
             self.failed += attempt > 0
             sent, sent_ns = self.put(surface_nm, valid_ns=valid_ns, sequence=sequence, clear_id=clear_id)
             times_ns[sent] = sent_ns
-            while self.connection.now_ns() < sent_ns + ANSWER_S * NS:
+            while self.connection.now_ns() < sent_ns + ANSWER_S * NS_PER_S:
                 self.collect(POLL_S)
                 for message, state in self.states[before:]:
                     if (command_ns := times_ns.get(state.frame_sequence)) is not None:

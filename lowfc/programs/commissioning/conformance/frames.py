@@ -10,7 +10,7 @@ from lowfc.contract.messages import FRAME, MONO16, wire
 from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.checks import Check, Table, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.camera import Camera
-from lowfc.programs.commissioning.conformance.connection import NS
+from lowfc.programs.commissioning.conformance.connection import NS_PER_S
 from lowfc.programs.commissioning.conformance.publisher import PROCESS, PUBLISHER
 from lowfc.programs.commissioning.conformance.settings import SETTINGS
 
@@ -62,9 +62,9 @@ def _frame_time(camera: Camera) -> Check:
     times = [frame.time_ns for frame in camera.frames]
     if not all(times):
         return wrong(f"{counted(times.count(0), 'frame')} without a timestamp", "set it in every frame")
-    back = sum(later <= earlier for earlier, later in pairwise(times))
-    if back:
-        got = f"{back} of {len(times) - 1} not later than the previous one"
+    not_later = sum(later <= earlier for earlier, later in pairwise(times))
+    if not_later:
+        got = f"{not_later} of {len(times) - 1} not later than the previous one"
         return wrong(got, "read the time for every exposure, from a clock that never steps")
     age_ns = int(np.median(np.subtract(camera.publish_times_ns, times)))
     exposure_ns = 0 if camera.settings is None else camera.settings.exposure_ns
@@ -117,8 +117,8 @@ def _steadiness(camera: Camera) -> Check:
         return warning("one frame", "use a longer --duration")
     period_ns = float(np.median(spans))
     elapsed_ns = camera.frames[-1].receive_time_ns - camera.frames[0].receive_time_ns
-    missing_ns = camera.seconds * NS - elapsed_ns
-    if missing_ns > max(_SILENT_PERIODS * period_ns, 0.2 * camera.seconds * NS, _STOPPED_NS):
+    missing_ns = camera.seconds * NS_PER_S - elapsed_ns
+    if missing_ns > max(_SILENT_PERIODS * period_ns, 0.2 * camera.seconds * NS_PER_S, _STOPPED_NS):
         got = f"frames during {elapsed_ns / 1e9:.1f} of {camera.seconds:g} s"
         return wrong(got, "the camera must publish whether or not a process subscribes; repeat while it is running")
     late_ns, longest_ns = float(np.percentile(np.abs(spans - period_ns), 99)), float(spans.max())

@@ -10,7 +10,7 @@ from lowfc.contract.messages import SEQUENCE_BOUND, from_timestamp, wire
 from lowfc.control.loop.wording import counted
 from lowfc.device.mirror_protection import MAX_VALID_NS
 from lowfc.programs.commissioning.checks import Check, Status, judged, ok, warning, wrong
-from lowfc.programs.commissioning.conformance.connection import NS
+from lowfc.programs.commissioning.conformance.connection import NS_PER_S
 from lowfc.programs.commissioning.conformance.dialogue import ANSWER_S, ATTEMPTS, MODAL_NM, Dialogue, Show
 from lowfc.programs.commissioning.conformance.publisher import PROCESS, PUBLISHER
 
@@ -19,7 +19,7 @@ EXPIRES_NS = 300_000_000  # validity of the command that is left to expire
 SLACK_NS = 400_000_000  # time by which the mirror may report the timeout late
 
 _FOLLOWING, _EXPIRED = wire.MIRROR_STATUS_FOLLOWING, wire.MIRROR_STATUS_EXPIRED
-_LONG_NS = 60 * NS
+_LONG_NS = 60 * NS_PER_S
 _REFUSED_EVERY_NS = 50_000_000  # between refused commands
 _RAISED_NM = 10.0  # height by which the mirror is raised before the command timeout
 _REFUSAL_S = 0.15  # time in which a command would show in the states
@@ -59,7 +59,7 @@ def mirror_checks(mirror: Dialogue, seconds: float, show: Show, *, gentle: bool 
     finally:
         if mirror.states and not _any_wrong(found, "grid", "state"):
             mirror.go(base_nm)
-    mirror.seconds = (mirror.connection.now_ns() - begun_ns) / NS
+    mirror.seconds = (mirror.connection.now_ns() - begun_ns) / NS_PER_S
     return [*found, *PUBLISHER.run(mirror), *PROCESS.run(mirror)]
 
 
@@ -123,8 +123,8 @@ def _ordinary_commands(mirror: Dialogue, base_nm: Single, seconds: float) -> Ite
     commanded_nm = base_nm
     durations_ns: list[int] = []
     same_time = unanswered = 0
-    end_ns, sign = connection.now_ns() + round(seconds * NS), 1
-    while connection.now_ns() < end_ns + ANSWER_S * NS * (mirror.failed > 0) and (answers or not unanswered):
+    end_ns, sign = connection.now_ns() + round(seconds * NS_PER_S), 1
+    while connection.now_ns() < end_ns + ANSWER_S * NS_PER_S * (mirror.failed > 0) and (answers or not unanswered):
         sign = -sign
         target_nm = base_nm + np.float32(sign) * mirror.expected.pattern_nm
         state, sent_ns, duration_ns = mirror.ask(target_nm)
@@ -135,7 +135,7 @@ def _ordinary_commands(mirror: Dialogue, base_nm: Single, seconds: float) -> Ite
         commanded_nm = target_nm
         durations_ns.append(duration_ns)
         same_time += from_timestamp(state.timestamp) == sent_ns
-        connection.wait(max(0.0, (sent_ns + period_ns - connection.now_ns()) / NS))
+        connection.wait(max(0.0, (sent_ns + period_ns - connection.now_ns()) / NS_PER_S))
     expected = f"a state with each command's frame_sequence within {ANSWER_S * 1e3:.0f} ms"
     unanswered, mirror.failed = unanswered + mirror.failed, 0
     yield _answers(mirror, durations_ns, unanswered)._replace(name="answers", expected=expected)
@@ -289,7 +289,7 @@ def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator
         mirror.listen(EXPIRES_NS / 2e9)
         for _ in range(round((EXPIRES_NS / 2 + SLACK_NS) / _REFUSED_EVERY_NS)):
             mirror.put(nan_nm, valid_ns=_LONG_NS)
-            mirror.listen(_REFUSED_EVERY_NS / NS)
+            mirror.listen(_REFUSED_EVERY_NS / NS_PER_S)
         expired_ns = _expired_ns(mirror, sent_ns)
         if held := expired_ns is not None and expired_ns - sent_ns >= 0.8 * EXPIRES_NS:
             break
@@ -309,7 +309,7 @@ def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator
     sent_ns, applied = mirror.connection.now_ns(), state is not None and state.status != _EXPIRED
     expected, advice = "a valid command is applied again", "apply a new command after the timeout"
     yield judged("after the dead-man", expected, applied, "applied", advice, "not applied")
-    mirror.listen((MAX_VALID_NS + SLACK_NS) / NS)
+    mirror.listen((MAX_VALID_NS + SLACK_NS) / NS_PER_S)
     expected = f"EXPIRED after at most {MAX_VALID_NS / 1e9:g} s, whatever valid_for_ns"
     late, bounded = f"not within {(MAX_VALID_NS + SLACK_NS) / 1e9:g} s", _expired_ns(mirror, sent_ns) is not None
     advice = "limit valid_for_ns in the driver: a sender's mistake must not hold the mirror for ever"

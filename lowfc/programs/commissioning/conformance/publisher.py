@@ -10,14 +10,14 @@ from lowfc.contract.errors import nearest
 from lowfc.contract.messages import EVENT, HEALTH, TOPICS, from_timestamp, wire
 from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.checks import Check, Table, ok, warning, wrong
-from lowfc.programs.commissioning.conformance.connection import NS, CollectedMessages
+from lowfc.programs.commissioning.conformance.connection import NS_PER_S, CollectedMessages
 
 LATE_NS = 20_000_000
 """Clock difference above which every frame of a camera with 100 Hz or more is refused as late by default."""
 
 _AHEAD_NS = 1_000_000  # time by which a message may appear to arrive before it was published
 _DECADE_S = 10 * 365 * 86_400
-_UNITS = {"microseconds": 1_000, "milliseconds": 1_000_000, "seconds": NS}
+_UNITS = {"microseconds": 1_000, "milliseconds": 1_000_000, "seconds": NS_PER_S}
 
 PUBLISHER: Table[CollectedMessages] = Table()
 """Checks of the messages of the main topic."""
@@ -28,11 +28,11 @@ PROCESS: Table[CollectedMessages] = Table()
 @PUBLISHER.check("envelope", "a zenoh attachment of 16 bytes: sequence and publish_time_ns, little-endian uint64")
 def _envelope(device: CollectedMessages) -> Check | None:
     messages = device.published
-    bare = [message.attachment for message in messages if message.envelope is None]
-    if not bare:
+    invalid = [message.attachment for message in messages if message.envelope is None]
+    if not invalid:
         return ok(f"on all of {len(messages)} messages") if messages else None
-    sizes = sorted({"none" if attachment is None else f"{len(attachment)} bytes" for attachment in bare})
-    got = f"attachment of {len(bare)} of {len(messages)} messages: {', '.join(sizes)}"
+    sizes = sorted({"none" if attachment is None else f"{len(attachment)} bytes" for attachment in invalid})
+    got = f"attachment of {len(invalid)} of {len(messages)} messages: {', '.join(sizes)}"
     return wrong(got, "attach it to every message; its bytes are in docs/reference/device_messages.md")
 
 
@@ -41,7 +41,7 @@ def _sequence(device: CollectedMessages) -> Check | None:
     sequences = [envelope.sequence for envelope in device.envelopes]
     if not sequences:
         return None
-    start, now_s = start_of(sequences[-1]), device.published[-1].receive_time_ns // NS
+    start, now_s = start_of(sequences[-1]), device.published[-1].receive_time_ns // NS_PER_S
     if start == 0:
         advice = "put the start into the upper 32 bits: without it messages after a restart are refused as old"
         return wrong(f"only a count ({sequences[-1]})", advice)
@@ -51,9 +51,9 @@ def _sequence(device: CollectedMessages) -> Check | None:
         advice = "write it little-endian" if big_endian else "put the unix seconds of the publisher's start there"
         return wrong(f"upper 32 bits {start}, present time {now_s}", advice)
     steps = [later - earlier for earlier, later in pairwise(sequences) if start_of(earlier) == start_of(later)]
-    back, gaps = sum(step <= 0 for step in steps), [step - 1 for step in steps if step > 1]
-    if back:
-        got = f"{back} of {len(steps)} not above the previous one"
+    not_above, gaps = sum(step <= 0 for step in steps), [step - 1 for step in steps if step > 1]
+    if not_above:
+        got = f"{not_above} of {len(steps)} not above the previous one"
         return wrong(got, "count every message of this topic, in one thread; such messages are refused")
     if gaps:
         got = f"{sum(gaps)} missing, in {counted(len(gaps), 'gap')} among {len(sequences)} messages"
@@ -75,20 +75,20 @@ def _publish_time(device: CollectedMessages) -> Check | None:
     lag_ns = int(np.median([arrival - time for arrival, time in zip(arrivals, times, strict=True)]))
     if not -_AHEAD_NS <= lag_ns <= LATE_NS:
         side = "before" if lag_ns > 0 else "after"
-        got = f"{abs(lag_ns) / 1e6:.3g} ms {side} the arrival" if abs(lag_ns) < 3600 * NS else f"{times[-1]} ns"
+        got = f"{abs(lag_ns) / 1e6:.3g} ms {side} the arrival" if abs(lag_ns) < 3600 * NS_PER_S else f"{times[-1]} ns"
         return wrong(got, _clock_advice(times[-1], arrivals[-1], device.connection.offset_ns))
-    back = sum(later <= earlier for earlier, later in pairwise(times))
-    if back:
-        got = f"{back} of {len(times) - 1} not later than the previous one"
+    not_later = sum(later <= earlier for earlier, later in pairwise(times))
+    if not_later:
+        got = f"{not_later} of {len(times) - 1} not later than the previous one"
         return wrong(got, "read the time for every message, from a clock that never steps")
     return ok(f"{lag_ns / 1e3:.0f} us before the arrival, median of {len(times)}")
 
 
 def _clock_advice(time_ns: int, now_ns: int, offset_ns: int) -> str:
     for unit, factor in _UNITS.items():
-        if abs(time_ns * factor - now_ns) < 3600 * NS:
+        if abs(time_ns * factor - now_ns) < 3600 * NS_PER_S:
             return f"the unit is {unit}: use nanoseconds"
-    if abs(time_ns + offset_ns - now_ns) < NS:
+    if abs(time_ns + offset_ns - now_ns) < NS_PER_S:
         return f"this is CLOCK_MONOTONIC: add the offset of this boot, {offset_ns} ns (Health.clock_offset_ns)"
     return "use CLOCK_MONOTONIC plus the offset of this boot (Health.clock_offset_ns), which all processes share"
 

@@ -61,8 +61,8 @@ def _huge_pages(facts: Facts) -> Check:
         reason, cost = refused
         return warning(f"refused: {reason}", "a kernel of version 6.1 or newer, with transparent huge pages", cost)
     text = facts.host.text("sys/kernel/mm/transparent_hugepage/enabled")
-    when = text[text.index("[") + 1 : text.index("]")]
-    return ok(when) if when != "always" else warning(when)
+    setting = text[text.index("[") + 1 : text.index("]")]
+    return ok(setting) if setting != "always" else warning(setting)
 
 
 @CHECKS.check(
@@ -95,9 +95,9 @@ def _socket_buffers(facts: Facts) -> Check:
     """Bytes that sockets buffer for a slow reader: `net.core.{r,w}mem_{default,max}` and `net.ipv4.tcp_{r,w}mem`."""
     net, read = "proc/sys/net", facts.host.text
     default_bytes, largest_bytes = (
-        min(int(read(f"{net}/core/{way}mem_{which}")) for way in "rw") for which in ("default", "max")
+        min(int(read(f"{net}/core/{direction}mem_{size}")) for direction in "rw") for size in ("default", "max")
     )
-    tcp_bytes = min(int(read(f"{net}/ipv4/tcp_{way}mem").split()[2]) for way in "rw")
+    tcp_bytes = min(int(read(f"{net}/ipv4/tcp_{direction}mem").split()[2]) for direction in "rw")
     held_s = tcp_bytes / facts.bytes_per_s
     detail = (
         f"TCP up to {tcp_bytes / 1e3:.0f} kB, {held_s * 1e3:.0f} ms of the loop's traffic; other sockets "

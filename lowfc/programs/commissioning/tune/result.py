@@ -97,10 +97,10 @@ class TuneResult(Result):
 
     def head(self) -> Sequence[str]:
         """Source of the tuning data."""
-        some = f"closed in {self.frames_closed} of them" if self.frames_closed else "open"
+        partly_closed = f"closed in {self.frames_closed} of them" if self.frames_closed else "open"
         return [
             f"{self.source}: {counted(self.frames, 'frame')} at {self.rate_hz:.4g} Hz, loop "
-            f"{'closed' if self.closed else some}, delay {self.delay_frames:.2f} frames, law {self.law_now}"
+            f"{'closed' if self.closed else partly_closed}, delay {self.delay_frames:.2f} frames, law {self.law_now}"
         ]
 
     def remarks(self) -> Sequence[str]:
