@@ -258,7 +258,7 @@ def test_command_is_recorded_and_reproduces_the_layout(tmp_path, monkeypatch):
         (("--seed", "-1"), "seed must not be negative"),
         (("--chains", "0"), "chains must be at least 1"),
         (("--steps", "0"), "steps must be at least 1"),
-        (("--name", "a b"), "--name must be"),
+        (("--name", "a b"), "--name must consist of"),
         (("--holes", "40", "--diameter", "0.2"), "40 holes .* could not be placed"),
         (("--holes", "1", "--diameter", "1"), "1 hole of .* could not be placed"),
         (("--scheduler", "nowhere:1"), "no Dask scheduler answers at 'nowhere:1'"),
