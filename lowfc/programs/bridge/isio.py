@@ -32,7 +32,7 @@ _POLL_S = 0.005
 _REQUEST_PERIOD_S = 0.1
 """Shortest time between two requests for a channel that changes continuously."""
 _RETRY_S = 2.0
-"""Time from a refusal to the next request, long, because each refused request is in the log."""
+"""Time from a refusal to the next request: long, because each refused request is in the log."""
 
 
 def bridge_isio(

@@ -9,7 +9,7 @@ from lowfc.arrays import Array
 from lowfc.optics.chain.added_contrast import ModalContrast, by_group, costliest
 
 QUADRATIC = "; quadratic form, valid to 3 nm rms of a mode"
-"""Method for the added contrast of a running loop: to 3 nm rms of a mode, within 10 % of full images (shaped pupil)."""
+"""Method for the added contrast of a running loop. To 3 nm rms of a mode, full images agree to 10 % (shaped pupil)."""
 ESTIMATED = ", estimated from the sensor"
 """Source of the added contrast of a running loop whose true wavefront is not known."""
 
@@ -54,7 +54,7 @@ def contrast_cases(added: Mapping[str, float]) -> dict[str, float | None]:
 def contrast_in_words(
     added: Mapping[str, float | None], most: tuple[str, float] | None, beyond: Sequence[str] = (), how: str = ""
 ) -> str:
-    """The added contrast of each case, the modes that add `most` in the last case, and `how` the contrast was computed.
+    """The added contrast of each case, the modes with the largest share of the last (`most`), and the method (`how`).
 
     A caveat names the cases in `beyond`, for which full images differ from the quadratic form.
     """

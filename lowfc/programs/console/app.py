@@ -33,11 +33,11 @@ from lowfc.programs.view.verdicts.tile import FILL, INK, clock
 READ_PERIOD_S = 0.2
 """Time between two readings."""
 PICTURES_EVERY = 3
-"""Readings from one drawing of the pictures to the next."""
+"""Number of readings from one drawing of the pictures to the next."""
 RESTARTED = "restarted"
 """Result of the application if the run restarted and must be joined again."""
 _LEFT = 62  # columns of the left half
-_RESTART_CHECK_EVERY = 10  # readings
+_RESTART_CHECK_EVERY = 10  # number of readings from one check to the next
 
 
 class Console(OrderedKeys):

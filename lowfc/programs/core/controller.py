@@ -304,7 +304,7 @@ class Controller:
         self._camera.mailbox.wake()
 
     def _update_latch(self) -> None:
-        """Set or clear the latch if safe mode began or ended; after the reply, and in the latch's own thread."""
+        """Set or clear the latch if safe mode began or ended: after the reply, by the latch's own thread."""
         safe = self._state.mode is LoopMode.SAFE or safe_pending(self._settings, self._state)
         if safe is not self._latched_safe:
             self._latched_safe = safe

@@ -73,7 +73,7 @@ class Offload:
         self._sum_nm, self._count = np.zeros(0), 0
 
     def add(self, step: Step, noll: tuple[int, ...]) -> None:
-        """Add a step with these modes; publish when the count is complete."""
+        """Add a step with these modes; publish the average once it is over `frames` frames."""
         if self._noll != noll:
             self._sum_nm, self._count, self._noll = np.zeros(len(noll)), 0, noll
         self._sum_nm += step.command_nm

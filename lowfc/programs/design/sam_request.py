@@ -18,8 +18,8 @@ class Search:
         estimator: pinv, or weighted for the Cramer-Rao bound. Default: weighted; pinv for the merit paper.
         modes: Modes in Table 3 and the condition number: 14 or 20.
         weight: Weight w, 0 to 1. pareto minimises table3^(1 - w) table4^w. paper minimises the largest ratio to the
-            paper's values; ratios in Table 3 have the exponent 2 w, that in Table 4 has 2 (1 - w). Default: 0.5; with
-            pareto, another weight for each chain, from 0 to 1 along a front.
+            paper's values; the ratios in Table 3 have the exponent 2 w, the ratio in Table 4 has 2 (1 - w). Default:
+            0.5; with pareto, another weight for each chain, from 0 to 1 along a front.
         focal_mask: disk, bowtie or both. Default: disk; both for the merit paper.
         holes: Number of holes, or FEWEST:MOST.
         diameter: Diameter of the holes, or SMALLEST:LARGEST, in pupil diameters.

@@ -107,7 +107,7 @@ def judge(trials: Sequence[ProbeResponse], configuration: Configuration) -> Capt
         raise AcceptanceError("the gains of the tested modes are zero: they have no capture range")
     modes = []
     for noll in dict.fromkeys(trial.parameters["noll"] for trial in trials):
-        # A repeated level keeps its last trial.
+        # Of a repeated level, only the last trial counts.
         trial_of_level = {trial.parameters["level_nm"]: trial for trial in trials if trial.parameters["noll"] == noll}
         converged = {level_nm: shape_removed(trial) for level_nm, trial in trial_of_level.items()}
         lost = [abs(level_nm) for level_nm, success in converged.items() if not success]

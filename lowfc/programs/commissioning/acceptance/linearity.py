@@ -26,7 +26,7 @@ from lowfc.programs.commissioning.acceptance.probe import (
 KIND: Kind = "linearity"
 AMPLITUDES = (0.5, 1.0, 2.0)
 """Amplitudes tested, as multiples of the required linear range."""
-_SPARE_FRAMES = 2  # skipped in addition to the delay, while the mirror settles
+_SPARE_FRAMES = 2  # frames skipped in addition to the delay, while the mirror settles
 
 
 class Level(Result):

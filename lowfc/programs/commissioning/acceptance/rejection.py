@@ -34,7 +34,7 @@ MIN_JUDGED = 0.5
 
 The noise transfer has no such limit: where it is small, it is below the measurement noise.
 """
-_LEAD_FRAMES = 50  # played before the measured period, besides the settling time: the bus delivers the first steps late
+_LEAD_FRAMES = 50  # frames before the period, besides those of settling: the bus delivers the first steps late
 
 
 class Comparison(Result):

@@ -166,7 +166,7 @@ def measured_calibration(
 
 
 def computed_noise_nm(config: Configuration, calibration: Calibration, computed: Calibration) -> Array | None:
-    """Noise (modes,) of a computed reconstructor at the flux of a calibration, nm; None if it is of another sensor."""
+    """Noise (modes,) of the computed R at the flux of a calibration, nm; None if that R is of another sensor."""
     if not comparable(calibration, computed):
         return None
     return factory.frame_noise_nm(config, replace(calibration, reconstructor=computed.reconstructor * calibration.good))

@@ -55,7 +55,7 @@ class Calibrator:
 
     Attributes:
         request: the requested calibration.
-        computed: the computed calibration.
+        computed: calibration computed with the optical model.
         config: configuration of the loop.
         in_use: calibration in use.
         pokes: the probe sequences.
@@ -77,7 +77,7 @@ class Calibrator:
             request: The requested calibration.
             report: Receives messages for the user.
             progress: Receives the number of frames done and in total.
-            computed: The computed calibration; its R may start the fit, if it has the loop's frame size and modes.
+            computed: Calibration of the optical model; its R may start the fit, if frame size and modes are the loop's.
         """
         self._loop = loop
         self.request = request
@@ -259,7 +259,7 @@ def store(path: Path, sums: Sums, conditions: dict[str, Any]) -> None:
 
 
 def resumed(path: Path, conditions: dict[str, Any]) -> Sums:
-    """Read completed cycles; DataFileError if there are none, if the file is damaged, or if its conditions differ."""
+    """Read completed cycles; DataFileError if there are none, if the file is damaged, or if it has other conditions."""
     stored, sums = stored_cycles(path)
     for key, value in conditions.items():
         if stored.get(key) != value:

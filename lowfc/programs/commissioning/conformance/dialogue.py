@@ -30,7 +30,7 @@ Show = Callable[[str], None]
 
 _PATTERN_SEED = 5
 _ORDINARY = 0.05  # size of ordinary commands as a fraction of the smallest of stroke, slew and half neighbour limit
-_MAX_MOVES = 400  # to a distant shape
+_MAX_MOVES = 400  # largest number of moves on the way to a distant shape
 
 
 class Expected:

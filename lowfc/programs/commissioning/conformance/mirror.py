@@ -20,11 +20,11 @@ SLACK_NS = 400_000_000  # time by which the mirror may report the timeout late
 
 _FOLLOWING, _EXPIRED = wire.MIRROR_STATUS_FOLLOWING, wire.MIRROR_STATUS_EXPIRED
 _LONG_NS = 60 * NS_PER_S
-_REFUSED_EVERY_NS = 50_000_000  # between refused commands
+_REFUSED_EVERY_NS = 50_000_000  # time between two commands that must be refused
 _RAISED_NM = 10.0  # height by which the mirror is raised before the command timeout
 _REFUSAL_S = 0.15  # time in which a command would show in the states
 _NEAR, _BEYOND, _FAR = 0.9, 1.05, 2.0  # multiples of a limit
-_SETTLE_S = 0.05  # for drivers that report measured actuator heights, not the targets
+_SETTLE_S = 0.05  # settling time of drivers that report measured actuator heights, not the targets
 
 
 def mirror_checks(mirror: Dialogue, seconds: float, show: Show, *, gentle: bool = False) -> list[Check]:

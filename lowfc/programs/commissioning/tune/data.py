@@ -37,7 +37,7 @@ from lowfc.programs.cli.status import holds_shape
 from lowfc.programs.logs.what_if.run import LoggedRun, SeenCommands, during_probe
 
 _SETTLING_S = 0.5  # least time excluded after the loop was closed, if enough frames are left
-_POLL_FRAMES = 100  # between two requests for the state of a running loop
+_POLL_FRAMES = 100  # frames between two requests for the state of a running loop
 
 
 @dataclass(frozen=True, slots=True)

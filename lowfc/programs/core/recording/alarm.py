@@ -1,4 +1,4 @@
-"""Runs the command of `recorder.on_event` when an event of its level or above occurs.
+"""Runs the command `recorder.on_event` when an event of the level `recorder.on_event_level` or above occurs.
 
 The recorder runs it, because a run has at most one recorder, which receives every event and is not in the loop; a
 console may be closed, or open twice. The command is started by a thread without real-time priority, and so

@@ -13,7 +13,8 @@ from lowfc.contract.messages import CAMERA_STATE, HEALTH, TOPICS, wire
 class Peers:
     """The last `Health.state` of each process; `newest` has the last message of every other key that can be queried.
 
-    A log starts with these: calibration, law, probe table, bench values, and the states of camera and controller.
+    A log starts with the messages in `newest`: calibration, law, probe table, bench values, and the states of camera
+    and controller.
     """
 
     def __init__(self, bus: Bus) -> None:
