@@ -7,7 +7,7 @@ import numpy as np
 
 _MIN_NS = 1_000
 RATIO = 1.01  # ratio of the upper to the lower edge of a bin
-_BINS_PER_LOG = 1 / log(RATIO)
+_BINS_PER_LOG = 1 / log(RATIO)  # bins for each factor of e
 _BINS = 2_000
 
 
@@ -15,7 +15,7 @@ class Durations:
     """Histogram of durations with bins of 1 %, from 1 us to 430 s; the largest duration is exact."""
 
     def __init__(self) -> None:
-        self._counts = array("q", [0] * _BINS)  # an element is incremented faster than one of a numpy array
+        self._counts = array("q", [0] * _BINS)  # its elements are incremented faster than those of a numpy array
         self.count = 0
         self.max_ns = 0
 

@@ -9,7 +9,7 @@ import numpy as np
 def identity(parts: Iterable[tuple[str, object]]) -> str:
     """SHA-256 of named parts in their order; empty arrays and None are skipped.
 
-    The names are those of 0.1 and never change, so that files and logs keep their identities.
+    The names are those of release 0.1 and never change, so that the content of files and logs keeps its identity.
     """
     digest = hashlib.sha256()
     for name, value in parts:

@@ -1,4 +1,7 @@
-"""Change dark, pixel mask or reference image of a calibration, and recompute I0, H and R, not `actuators_to_modes`."""
+"""Change the dark, the pixel mask or the reference image of a calibration, and adapt I0, H and R to the change.
+
+`actuators_to_modes` is not adapted.
+"""
 
 from dataclasses import replace
 
@@ -12,17 +15,19 @@ _MIN_RESPONSE = 1e-3
 """Singular value of R H, relative to the largest, below which a combination of modes counts as not measured."""
 
 
-def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_e: float, gain_e: float) -> Calibration:
-    """The calibration with another dark (pixels,), DN, and only the pixels (pixels,) that are 1 in `good`.
+def with_dark(
+    calibration: Calibration, dark_dn: Array, good: Array, read_noise_e: float, gain_e_per_dn: float
+) -> Calibration:
+    """The calibration with another dark (pixels,), DN, and only those pixels for which `good` (pixels,) is 1.
 
-    As `on_pixels`, but a plain R (see `_is_plain`) is recomputed with this read noise of a pixel and with `gain_e`
-    electrons per DN.
+    R is that of `on_pixels`; a plain R (see `_is_plain`) is recomputed instead, with a read noise of `read_noise_e`
+    electrons per pixel and a gain of `gain_e_per_dn`.
 
     Raises:
         ValueError: the remaining pixels have no light, or do not tell the modes apart.
     """
     changed = replace(on_pixels(calibration, good), dark=single(dark_dn))
-    return _reconstructed(changed, read_noise_e, gain_e) if _is_plain(calibration) else changed
+    return _reconstructed(changed, read_noise_e, gain_e_per_dn) if _is_plain(calibration) else changed
 
 
 def on_pixels(calibration: Calibration, good: Array) -> Calibration:
@@ -45,13 +50,12 @@ def on_pixels(calibration: Calibration, good: Array) -> Calibration:
 
 
 def with_reference(
-    calibration: Calibration, reference: Array, flux_dn: float, read_noise_e: float, gain_e: float
+    calibration: Calibration, reference: Array, flux_dn: float, read_noise_e: float, gain_e_per_dn: float
 ) -> Calibration:
     """The calibration with another reference image (pixels,), in flux fractions, and mean flux, DN.
 
-    H stays. A plain R (see `_is_plain`) is recomputed with this read noise of a pixel and with `gain_e` electrons per
-    DN; any other R stays.
-    `operator_hash` and `id` of the result are empty.
+    H stays. A plain R (see `_is_plain`) is recomputed, with a read noise of `read_noise_e` electrons per pixel and a
+    gain of `gain_e_per_dn`; any other R stays. `operator_hash` and `id` of the result are empty.
 
     Raises:
         ValueError: there is no light on the good pixels.
@@ -59,7 +63,7 @@ def with_reference(
     I0, _ = normalise_flux(reference, calibration.response.astype(np.float64), calibration.good.astype(np.float64))
     changed = replace(calibration, reference=single(I0), flux_dn=flux_dn)
     if _is_plain(calibration):
-        return _reconstructed(changed, read_noise_e, gain_e)
+        return _reconstructed(changed, read_noise_e, gain_e_per_dn)
     return replace(changed, operator_hash="", id="")
 
 
@@ -90,14 +94,14 @@ def _rank(matrix: Array) -> int:
     return int(np.linalg.matrix_rank(matrix, rtol=_MIN_RESPONSE))
 
 
-def _reconstructed(calibration: Calibration, read_noise_e: float, gain_e: float) -> Calibration:
+def _reconstructed(calibration: Calibration, read_noise_e: float, gain_e_per_dn: float) -> Calibration:
     """Recompute R from I0 and H, with the weights of its estimator."""
     reconstruction = reconstruct(
         calibration.reference.astype(np.float64),
         calibration.response.astype(np.float64),
         None,
         calibration.good.astype(np.float64),
-        calibration.flux_dn * gain_e,
+        calibration.flux_dn * gain_e_per_dn,
         read_noise_e,
         calibration.estimator.partition("+")[0],
     )

@@ -1,8 +1,8 @@
 """Placement of a real sensor's image relative to the computed one: scale, centre, rotation, parity.
 
-The image of a flat wavefront through a pupil that is symmetric or without phase is unchanged by a rotation of 180
-degrees, so the reference image alone leaves this ambiguity. In the wrong orientation, odd modes such as tip and tilt
-have the opposite sign (all modes, if the pupil has no phase): a poke of an odd mode shows which orientation is right.
+A rotation by 180 degrees does not change the image of a flat wavefront if the pupil is symmetric about its centre or
+has no phase, so the reference image alone leaves this ambiguity. In the wrong orientation, odd modes such as tip and
+tilt have the opposite sign (all modes, if the pupil has no phase): a poke of an odd mode shows the right orientation.
 If a reflection does not change the image either, as without a mask in the relay pupil, pokes of both tip and tilt are
 needed. If the image is circular, only these pokes show the rotation.
 """
@@ -18,11 +18,12 @@ from scipy.optimize import least_squares
 from lowfc.arrays import Array, Complex, Mask
 
 _ANGLES = 72
-"""Number of initial rotations, spread over 180 degrees."""
-_ALIKE, _EXACT = 2.0, 0.01
-"""The other parity is possible, too, if its residual is below `_ALIKE` times the better parity's, or below `_EXACT`."""
+"""Number of rotations that are tried before the fit, spread over 180 degrees."""
+_MAX_RESIDUAL_RATIO, _SMALL_RESIDUAL = 2.0, 0.01
+"""The parity with the larger residual is possible, too, if this residual is below
+`_MAX_RESIDUAL_RATIO` times the smaller one, or below `_SMALL_RESIDUAL`."""
 _CIRCULAR = 0.05
-"""An image counts as circular if rotations change it by less than this fraction; a circle on pixels changes by 0.01."""
+"""An image counts as circular if rotations change it by less than this fraction; sampling changes a circle by 0.01."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +57,7 @@ class Alignment:
         geometry: Geometry of the better parity; its rotation may be off by 180 degrees.
         background: Background of each real pixel, in the unit of the image.
         residual: Rms of real minus fitted image, relative to the standard deviation of the real image.
-        other_parity: The same residual for the other parity.
+        other_parity: Residual for the other parity, also relative.
         orientations: Geometries that the image does not distinguish.
         circular: Whether the image is the same at all rotations, so that the rotations in `orientations` are arbitrary.
     """
@@ -70,9 +71,9 @@ class Alignment:
 
 
 def onto(image: Array, geometry: Geometry, shape: tuple[int, int]) -> Array:
-    """Resample a computed image (rows, columns), or images (rows, columns, many), onto the real sensor's pixels.
+    """Resample a computed image (rows, columns), or images (rows, columns, images), onto the real sensor's pixels.
 
-    Flux is conserved. Between pixels the image is a cubic spline; outside it is zero.
+    Flux is conserved. The image is a cubic spline between its pixels, and zero beyond them.
 
     Args:
         image: Image on the computed sensor, in any unit.
@@ -89,7 +90,7 @@ def align(real: Array, computed: Array, good: Mask | None = None) -> Alignment:
 
     Args:
         real: (rows, columns) real image, dark subtracted, any unit.
-        computed: (rows, columns) I0.
+        computed: (rows, columns) computed reference image, any unit.
         good: (rows, columns) whether each pixel is used; None for all.
 
     Raises:
@@ -102,7 +103,8 @@ def align(real: Array, computed: Array, good: Mask | None = None) -> Alignment:
     light = np.where(used, real - background, 0.0)
     if not light.sum() > 0:
         raise ValueError("the reference image has no light above the level of its edge pixels")
-    # Try scale 1, too: a detector region may cut off the image's wings. Rounding avoids two almost equal scales.
+    # Scale 1 is tried, too, as a detector region that cuts off the image's wings falsifies the ratio of sizes; rounding
+    # avoids two almost equal scales.
     scales = {round(_size(light) / _size(computed), 2), 1.0}
     spectrum = np.fft.rfft2(light, _doubled(light.shape))
     fits = []
@@ -122,7 +124,7 @@ def align(real: Array, computed: Array, good: Mask | None = None) -> Alignment:
         )
     _, _, background = _residual(_sample(spline, best, real.shape)[used], real[used])
     circular = _circular(spline, computed)
-    possible = [best, reflected] if circular or other < max(_ALIKE * residual, _EXACT) else [best]
+    possible = [best, reflected] if circular or other < max(_MAX_RESIDUAL_RATIO * residual, _SMALL_RESIDUAL) else [best]
     possible = [replace(each, rotation_deg=(each.rotation_deg + 90) % 180 - 90) for each in possible]
     orientations = [orientation for each in possible for orientation in (each, each.rotated(180))]
     return Alignment(possible[0], background, residual, other, orientations, circular)

@@ -1,4 +1,4 @@
-"""The calibration, and its reconstructor from reference image and response matrix; flux normalisation and noise."""
+"""The calibration; reconstructors from a reference image and a response matrix; normalisation by flux; noise."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,7 +18,7 @@ FIRST = "+first"
 """Suffix of `Calibration.estimator` for the first calibration of a commissioning."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)  # compared by identity, so that a cache can hold it
+@dataclass(frozen=True, slots=True, eq=False)  # hashed as an object, so that it can be a key of a cache
 class Calibration:
     """Matrices from a frame to modes and from modes to actuators; single precision, as in the loop.
 
@@ -37,7 +37,7 @@ class Calibration:
         saturation_dn: highest value a pixel can have.
         estimator: how R was computed: weighted or pinv, and fitted nuisance parameters, as in weighted+shear.
         wavelength_nm: wavelength of H.
-        operator_hash: hash of the optical model it was computed from; empty for a measured calibration.
+        operator_hash: hash of the optical model from which it was computed; empty for a measured calibration.
         id: identity of the calibration.
         camera: camera settings with which it was made; None if unknown.
     """
@@ -127,7 +127,7 @@ def normalise_flux(reference: Array, response: Array, good: Array) -> tuple[Arra
 
 
 def unnormalised(reconstructor: Array, reference: Array, good: Array) -> Array:
-    """R' (modes, pixels) with R' H = R N, where H is in the unit of I0 per nm, and N is H after `normalise_flux`."""
+    """R' (modes, pixels) for images not divided by their flux: R' H = R N, H in I0's unit per nm, N normalised H."""
     flux = _flux(reference, good)
     return np.asarray((reconstructor - np.outer(reconstructor @ reference / flux, good)) / flux)
 
@@ -161,9 +161,9 @@ def reconstructor(
         flux_e: Electrons on the good pixels.
         read_noise_e: Read noise of a pixel.
         estimator: One of `ESTIMATORS`.
-        nuisance: (pixels, any) responses to other changes of the image, normalised like H, in any unit. They are fitted
-            together with the modes, so that these changes are not measured as modes; R has no rows for them. A change
-            of flux needs no nuisance response.
+        nuisance: (pixels, parameters) responses to other changes of the image, normalised like H, in any unit. They are
+            fitted together with the modes, so that these changes are not measured as modes; R has no rows for them. A
+            change of flux needs no nuisance response.
 
     Raises:
         ValueError: unknown estimator, or modes or nuisance parameters that this sensor cannot tell apart.
@@ -185,9 +185,9 @@ def reconstructor(
     if nuisance is None:
         return np.asarray(np.linalg.pinv(scaled) * root.T)
     both = np.hstack([scaled, root * nuisance])
-    sizes = np.linalg.norm(both, axis=0)  # divided out, as pinv drops singular values far below the largest
+    sizes = np.linalg.norm(both, axis=0)  # divided out, as pinv drops small singular values, and the units differ
     if not (sizes.all() and condition_number(both / sizes) < SINGULAR):
-        raise ValueError("the sensor cannot tell the nuisance modes from the others: fit fewer of either")
+        raise ValueError("the sensor cannot tell modes and nuisance parameters apart: fit fewer of either")
     inverse = np.linalg.pinv(both / sizes) / sizes[:, None]
     return np.asarray((inverse * root.T)[: response.shape[1]])
 

@@ -23,9 +23,9 @@ class Dark(NamedTuple):
     Attributes:
         dark_dn: (pixels,) mean, DN.
         noise_dn: (pixels,) standard deviation from frame to frame, DN.
-        hot: (pixels,) whether a pixel is brighter than the others.
-        noisy: (pixels,) whether it is noisier than the others.
-        dead: (pixels,) whether it is stuck: without noise, unlike the others.
+        hot: (pixels,) whether a pixel is much brighter than most others.
+        noisy: (pixels,) whether a pixel is much noisier than most others.
+        dead: (pixels,) whether a pixel is stuck: it has no noise, unlike most others.
     """
 
     dark_dn: Array
@@ -61,18 +61,18 @@ def measure_dark(frames: npt.NDArray[np.number]) -> Dark:
         which = "1 pixel of the dark frames has" if bad == 1 else f"{bad} pixels of the dark frames have"
         raise ValueError(f"{which} values that are not finite: replace them by numbers")
     mean, noise = values.mean(axis=0), values.std(axis=0, ddof=1)
-    level, typical = float(np.median(mean)), float(np.median(noise))
-    mean_spread = max(_spread(mean), typical / np.sqrt(count), 1e-3)
-    noise_spread = max(_spread(noise), typical / np.sqrt(2 * count), 1e-3)
+    level, typical_noise = float(np.median(mean)), float(np.median(noise))
+    mean_spread = max(_robust_std(mean), typical_noise / np.sqrt(count), 1e-3)
+    noise_spread = max(_robust_std(noise), typical_noise / np.sqrt(2 * count), 1e-3)
     rounding_dn = _ROUNDING_DN * (1 + 4 / np.sqrt(count))  # in few frames, all values of a good pixel may be equal
-    hot = mean > level + max(_SIGMAS * mean_spread, _SIGMAS * typical / 4, rounding_dn)
+    hot = mean > level + max(_SIGMAS * mean_spread, _SIGMAS * typical_noise / 4, rounding_dn)
     if hot.mean() > 0.05:
         raise ValueError(
             f"{hot.mean():.0%} of the pixels are much brighter than the median of {level:.1f} DN: these frames are not "
             "dark; block the star, or switch it off"
         )
-    noisy = noise > max(typical + _SIGMAS * noise_spread, float(np.hypot(typical, rounding_dn)))
-    return Dark(mean, noise, hot, noisy, (noise < 0.05 * typical) & (typical > rounding_dn / 2))
+    noisy = noise > max(typical_noise + _SIGMAS * noise_spread, float(np.hypot(typical_noise, rounding_dn)))
+    return Dark(mean, noise, hot, noisy, (noise < 0.05 * typical_noise) & (typical_noise > rounding_dn / 2))
 
 
 def check_dark(dark_dn: Array, reference: Array, flux_dn: float) -> None:
@@ -89,16 +89,17 @@ def check_dark(dark_dn: Array, reference: Array, flux_dn: float) -> None:
 
 
 def light_in(dark_dn: Array, reference: Array) -> float:
-    """Flux of the star in supposedly dark frames (pixels,), DN, from its reference image (pixels,) in flux fractions.
+    """The star's flux, DN, in a dark (pixels,), DN; the star's reference image (pixels,) is in flux fractions.
 
-    It is the median of the pixels' fluxes, weighted by the reference: some of the brightest pixels may be hot.
+    Each pixel yields a flux. The result is their median, weighted by the reference, since some pixels may be hot.
     """
-    above_dn, above = dark_dn - np.median(dark_dn), reference - np.median(reference)
-    above_dn, above = above_dn[above != 0], above[above != 0]
-    order = np.argsort(above_dn / above)
-    weights = np.cumsum(np.abs(above[order]))
-    return float((above_dn / above)[order[np.searchsorted(weights, weights[-1] / 2)]])
+    dark_above, reference_above = dark_dn - np.median(dark_dn), reference - np.median(reference)
+    weighted = reference_above != 0
+    fluxes_dn, weights = dark_above[weighted] / reference_above[weighted], np.abs(reference_above[weighted])
+    order = np.argsort(fluxes_dn)
+    cumulative = np.cumsum(weights[order])
+    return float(fluxes_dn[order[np.searchsorted(cumulative, cumulative[-1] / 2)]])
 
 
-def _spread(values: Array) -> float:
+def _robust_std(values: Array) -> float:
     return float(_TO_SIGMA * np.median(np.abs(values - np.median(values))))

@@ -19,7 +19,7 @@ MIN_SNR = 10.0
 
 
 class Delay(NamedTuple):
-    """Response to a poke.
+    """Measured delay, and the image of the response to a poke.
 
     Attributes:
         delay_frames: a command computed from frame n first acts on the whole exposure of frame n + delay_frames.
@@ -51,12 +51,12 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
     """
     if len(fractions) < MIN_FRAMES:
         raise ValueError(f"the delay needs at least {MIN_FRAMES} frames without a gap, got {len(fractions)}")
-    # Photon noise is proportional to the square root of the light.
-    light = np.sqrt(np.maximum(reference, 0) + 1e-3 * reference.max())
+    # Photon noise of each pixel, in any unit: the square root of its light, with a floor for dark pixels.
+    noise = np.sqrt(np.maximum(reference, 0) + 1e-3 * reference.max())
     first = LAGS - 1
     instruments = _lagged(poke)
     moved = instruments if command is None else _lagged(poke + command)
-    rows = fractions[first:] / light
+    rows = fractions[first:] / noise
     halves = np.array_split(np.arange(len(rows)), 2)
     factors, variances = np.zeros(LAGS), np.zeros(LAGS)
     response = np.zeros(len(reference))
@@ -69,7 +69,7 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
         half_factors, errors = _regressed(detected, moved[detecting], instruments[detecting])
         factors += half_factors[:, 0] / 2
         variances += errors[:, 0] ** 2 / 4
-        response += direction * light * abs(left[:, 0].sum()) * values[0] / 2
+        response += direction * noise * abs(left[:, 0].sum()) * values[0] / 2
         power += float(((half_factors[:, 0] / errors[:, 0]) ** 2).sum())
     snr = float(np.sqrt(power))
     if snr < MIN_SNR:
@@ -90,15 +90,15 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
 
 
 def _lagged(row: Array) -> Array:
-    """(frames, lags): the value of each frame and of those before it, from the first frame that has all lags."""
+    """The value of each frame and of the frames before it (frames, lags), from the first frame that has all lags on."""
     first = LAGS - 1
     return np.stack([row[first - lag : len(row) - lag] for lag in range(LAGS)], axis=1)
 
 
 def _regressed(rows: Array, moved: Array, instruments: Array) -> tuple[Array, Array]:
-    """Factors (lags, columns) of each lag in rows (frames, columns), and their standard errors.
+    """Factors (lags, columns) of the motion `moved` (frames, lags) in rows (frames, columns), with standard errors.
 
-    With instrumental variables other than `moved`, motion caused by noise of the rows does not bias the factors.
+    With instrumental variables other than `moved`, motion that follows the noise of the rows does not bias the factors.
     """
     rows, moved, z = (each - each.mean(axis=0) for each in (rows, moved, instruments))
     inverse = np.linalg.inv(z.T @ moved)

@@ -9,10 +9,10 @@ import numpy.typing as npt
 
 from lowfc.arrays import Array, Integers, Single
 
-FEWEST_CYCLES = 3
-"""Least cycles of the lowest line in a period; with fewer, the line cannot be told from a drift of the mean."""
-_APART = 3  # least distance of the lines of a mode, in odd bins: the noise is measured between them
-_DRAWS = 32  # random sets of phases; the one with the lowest peak is used
+MIN_CYCLES_OF_LINE = 3
+"""Least number of cycles of a line in a period; with fewer, the line cannot be told from a drift of the mean."""
+_APART = 3  # least distance between two lines of a mode, in odd bins: the noise is measured between them
+_DRAWS = 32  # number of random sets of phases; the set with the lowest peak is used
 
 
 def lines(period_frames: int, modes: int, lines_per_mode: int, lowest: float, highest: float) -> list[Integers]:
@@ -29,15 +29,15 @@ def lines(period_frames: int, modes: int, lines_per_mode: int, lowest: float, hi
         For each mode (lines,), cycles per period: odd, ascending, and used by no other mode.
 
     Raises:
-        ValueError: the frequencies do not ascend within 0 to 0.5; or the period is too short for the lowest one, or
-            for so many lines.
+        ValueError: the frequencies do not ascend within 0 to 0.5; or the period is too short for the lowest frequency,
+            or for so many lines.
     """
     if not 0 < lowest < highest <= 0.5:
         raise ValueError(f"frequencies must ascend from above 0 to at most half of the rate, got {lowest}, {highest}")
-    if lowest * period_frames < FEWEST_CYCLES:
+    if lowest * period_frames < MIN_CYCLES_OF_LINE:
         raise ValueError(
             f"a period of {period_frames} frames holds {lowest * period_frames:.2g} cycles of the lowest frequency, it "
-            f"must be {FEWEST_CYCLES} or more"
+            f"must be {MIN_CYCLES_OF_LINE} or more"
         )
     first = int(np.ceil(lowest * period_frames)) | 1
     last = min(highest * period_frames, period_frames // 2 - 1)  # below half of the rate, where a sine has no phase
@@ -78,7 +78,7 @@ def multisine(period_frames: int, bins: list[Integers], rms_nm: float, seed: int
 
 
 def with_lead_in(period: Single, lead_frames: int) -> Single:
-    """A period (frames, modes) with its preceding frames as a lead-in, in which the loop settles."""
+    """A period (frames, modes), with a lead-in of its preceding `lead_frames` frames, in which the loop settles."""
     return np.concatenate([period[np.arange(-lead_frames, 0) % len(period)], period])
 
 
@@ -86,12 +86,12 @@ def build_staircase(levels_nm: npt.ArrayLike, hold_frames: int, largest_step_nm:
     """A staircase from zero over all levels and back to zero, in as few steps as the largest step allows.
 
     Args:
-        levels_nm: (levels,) in the order in which they are reached.
+        levels_nm: (levels,) levels, in the order in which they are reached.
         hold_frames: Frames at each level.
         largest_step_nm: Largest change from one frame to the next.
 
     Returns:
-        The staircase (frames,), and the first frame (levels,) at each level.
+        The staircase (frames,), nm, and the index of the first frame at each level (levels,).
     """
     parts, starts, at_nm, frames = [], [], 0.0, 0
     for level_nm in [*np.asarray(levels_nm, float).tolist(), 0.0]:

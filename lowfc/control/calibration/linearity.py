@@ -26,7 +26,7 @@ class Gains:
 
     Attributes:
         amplitude_nm: (amplitudes,) amplitude of the mode.
-        gain: (amplitudes, modes) ratio of the measured amplitude of each mode to the true one of `mode`.
+        gain: (amplitudes, modes) ratio of each mode's measured amplitude to the true amplitude of `mode`.
         error: (amplitudes, modes) standard error of the gain, from the scatter of the cycles.
         mode: index of the mode.
     """
@@ -38,7 +38,7 @@ class Gains:
 
     @property
     def crosstalk(self) -> Array:
-        """The gains (amplitudes, modes) with 0 for the mode itself."""
+        """The gains (amplitudes, modes) of the other modes; 0 for the mode itself."""
         others = self.gain.copy()
         others[:, self.mode] = 0.0
         return others
@@ -54,10 +54,10 @@ class Gains:
 
 
 def gains(error_nm: Array, mode: int, levels_nm: Array, starts: Integers, frames: int) -> Gains:
-    """Gain and cross-talk of a mode, from the open-loop errors (frames, modes) on a staircase of `levels` (levels,).
+    """Gain and cross-talk of a mode, from open-loop errors (frames, modes), nm, on a staircase of `levels` (levels,).
 
-    The mean over `frames` frames is taken at each level, from the frame in `starts` (levels,) on. A standard error
-    needs two cycles or more.
+    At each level, the errors are averaged over `frames` frames; `starts` (levels,) has the index of the first of them.
+    A standard error needs two cycles or more.
     """
     means = np.stack([error_nm[start : start + frames].mean(axis=0) for start in starts])
     per_cycle = (means * np.sign(levels_nm)[:, None]).reshape(-1, len(_SIGNS), error_nm.shape[1]).mean(axis=1)

@@ -9,9 +9,9 @@ from lowfc.control.calibration.calibration import Calibration, noise_nm2
 from lowfc.control.loop.camera import CameraSettings
 
 
-@lru_cache(maxsize=2)  # a verdict on the gains, the request for them and their use need the same covariance
+@lru_cache(maxsize=2)  # automatic gains need the same covariance when they are chosen, requested and applied
 def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: CameraSettings | None) -> Array | None:
-    """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront rms, with the flux normalisation.
+    """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront rms, after division by the frame's flux.
 
     It includes photon noise of I0 and read noise. None if the camera's gain or the flux is unknown. Read-only.
     """
@@ -34,7 +34,7 @@ def map_rows(
     camera: CameraSettings | None,
     *matrices: Single,
 ) -> list[Single]:
-    """Matrices M (modes, any), such as R, with the rows M_c - C_cu (C_uu + P_u)^-1 M_u for corrected modes c.
+    """Matrices M (modes, columns), such as R, with the rows M_c - C_cu (C_uu + P_u)^-1 M_u for corrected modes c.
 
     M_u are the rows of the uncorrected modes u, which stay as they are, P_u is their prior, and C the noise covariance
     of the calibration's own R. If this R is the weighted one for the same flux, the new rows of R are
@@ -43,7 +43,7 @@ def map_rows(
     Args:
         calibration: The calibration in use.
         prior_nm2: (modes,) mean square of an uncorrected mode; 0 for a corrected mode.
-        flux_dn: Sum of the good pixels, for the weights.
+        flux_dn: Sum of the good pixels, DN, from which C is computed.
         camera: Camera settings; if they or their gain are unknown, or no mode or every mode is corrected, the matrices
             are returned unchanged.
         matrices: The matrices M.

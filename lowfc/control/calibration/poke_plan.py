@@ -24,7 +24,7 @@ class Plan:
         table: (frames, columns) amplitudes of each frame's command, in the unit of its shapes: nm rms of wavefront for
             modes, nm of surface for single actuators.
         used: (frames,) whether an exposure that sees only this row may be used.
-        per_column: number of used frames in which a column is poked: the least of all columns.
+        per_column: number of used frames in which a column is poked; if columns differ, the least number.
     """
 
     table: Array
@@ -83,8 +83,8 @@ def dither(columns: int, amplitude: float, frames: int, hold: int, seed: int) ->
     return Plan(table, np.ones(frames, np.bool_), frames)
 
 
-def frames_for(snr: float, noise_nm: float, amplitude_nm: float) -> int:
-    """Number of frames with pokes of this amplitude that determine R to 1 / snr, for this noise per frame."""
+def frames_for_snr(snr: float, noise_nm: float, amplitude_nm: float) -> int:
+    """Number of frames with pokes of this amplitude that determine R H to 1 / snr, for this noise per frame."""
     return int(np.ceil((snr * noise_nm / amplitude_nm) ** 2))
 
 
@@ -93,8 +93,8 @@ def seen(table: Array, weights: Array, sequence: npt.NDArray[np.integer], comman
 
     Args:
         table: A row for each frame from the first one of the sequence; before and after it, zeros.
-        weights: (lags,) fractions that an exposure sees of the rows 0, 1, ... frames before its own; they sum to 1.
-        sequence: (exposures,) number of the frame, ascending, counted from the one whose command had the first row.
+        weights: (lags,) fraction of an exposure during which it sees the row 0, 1, ... frames before its own; sum 1.
+        sequence: (exposures,) frame numbers, ascending; 0 is the frame whose command had the first row.
         commanded: (exposures,) whether the frame led to a command; if not, or if the frame is missing, the mirror kept
             the previous row.
 
@@ -119,7 +119,7 @@ def usable(plan: Plan, sequence: npt.NDArray[np.integer], commanded: Mask, lag: 
 
     Args:
         plan: The plan that was played.
-        sequence: (exposures,) number of the frame, ascending, counted from the one whose command had the first row.
+        sequence: (exposures,) frame numbers, ascending; 0 is the frame whose command had the first row.
         commanded: (exposures,) whether the frame led to a command.
         lag: Whole frames from a row's frame to the exposure that sees it.
     """

@@ -60,7 +60,7 @@ def reconstruct(
         read_noise_e: Read noise of a pixel.
         estimator: For a computed H: weighted or pinv, as for `calibration.reconstructor`.
         truncate: Combinations of modes with a singular value below this fraction of the largest are dropped.
-        tikhonov: Combinations are damped by s^2 / (s^2 + (tikhonov s_largest)^2).
+        tikhonov: A combination with singular value s is multiplied by s^2 / (s^2 + (tikhonov s_largest)^2).
 
     Raises:
         ValueError: an argument is out of range, or H does not tell the modes apart.
@@ -129,7 +129,7 @@ def advice(reconstruction: Reconstruction, noll: tuple[int, ...], limit_nm: Sing
     worst = np.argsort(-np.abs(reconstruction.combinations[:, bad[-1]]))[:2]
     names = " and ".join(f"Z{noll[mode]}" for mode in worst)
     cut = reconstruction.singular_values[bad[0]] / reconstruction.singular_values[0]
-    drop = f", or drop them with --truncate {1.01 * cut:.3g}" if bad[0] else ""  # nothing would be left if all are bad
+    drop = f", or drop them with --truncate {1.01 * cut:.3g}" if bad[0] else ""  # if all are bad, none would be left
     return (
         f"{bad.size} of {len(noll)} combinations of modes (mostly {names}) are measured with more noise than "
         f"their limit of {limits_nm[bad].min():g} nm: use fewer modes, lower their gains{drop}"

@@ -68,7 +68,7 @@ class Sums(NamedTuple):
 
     Attributes:
         initial: R_a.
-        answers: (cycles, modes, modes) R_a H of each cycle, without unit; the name is that in files of 0.1.
+        answers: (cycles, modes, modes) R_a H of each cycle, without unit; files of release 0.1 have this name.
         response: (pixels, modes) sum of H.
         reference: (pixels,) sum of I0 over `references` cycles.
         references: number of cycles with frames without a poke.
@@ -150,7 +150,7 @@ def cycle_response(
         seen: (frames, modes) modes of the mirror in each exposure, nm of wavefront.
         instruments: (frames, modes) instrumental variables: the poke alone in each exposure; `seen` in open loop.
         used: (frames,) whether a frame is usable.
-        slowest: Frequency, cycles per frame, below which pokes are not used: most of the disturbance is there.
+        slowest: Frequency, cycles per frame, below which changes of the pokes are not used: most disturbance is there.
 
     Raises:
         ValueError: the pokes in the usable frames do not tell the modes apart.
@@ -174,7 +174,7 @@ def cycle_response(
 
 
 def _slow(times: Integers, frames: int, slowest: float) -> Array:
-    """Orthonormal basis (times, any) of slow changes in a piece: the mean, and all cosines below `slowest`."""
+    """Orthonormal basis (times, functions) of slow changes in a piece: the mean, and all cosines below `slowest`."""
     orders = np.arange(1 + int(2 * frames * slowest))
     return np.linalg.qr(np.cos(np.pi * np.outer((times + 0.5) / frames, orders)))[0]
 
@@ -223,7 +223,7 @@ def row_error(products: Array) -> Array:
 
 
 def best_initial(candidates: list[Initial], response: Array, mode: int, variance: Array) -> Initial:
-    """The candidate with the least noise in a mode; a later one must have less than `_BETTER` of an earlier one's.
+    """The candidate with the least noise in a mode; a later one replaces it if below `_BETTER` times its noise.
 
     The response (pixels,) to a poke of the mode is in flux fractions; `variance` (pixels,) is a frame's noise variance.
     """
@@ -270,7 +270,7 @@ class Check(NamedTuple):
     def within(self, rms: float, largest: float) -> bool:
         """Whether the cross-talk is below these limits, within the noise of these frames."""
         modes = len(self.error)
-        unsure = _MEAN_SQUARE_ERRORS * float(np.sqrt(2 * (self.error**4).sum() / modes**3))  # error of the mean square
+        unsure = _MEAN_SQUARE_ERRORS * float(np.sqrt(2 * (self.error**4).sum() / modes**3))  # of the mean square
         return bool(self.rms**2 <= rms**2 + unsure and self.largest <= self.bound(largest))
 
     def bound(self, largest: float) -> float:

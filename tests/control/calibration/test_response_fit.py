@@ -14,7 +14,7 @@ from lowfc.control.calibration.poke_plan import (
     SIGNS,
     cycle,
     dither,
-    frames_for,
+    frames_for_snr,
     hadamard_patterns,
     poke_patterns,
     seen,
@@ -81,8 +81,8 @@ def test_a_dither_depends_on_its_seed() -> None:
 
 
 def test_the_number_of_frames_grows_with_the_square_of_the_signal_to_noise_ratio() -> None:
-    assert frames_for(100, 2.0, 4.0) == 2500
-    assert frames_for(200, 2.0, 4.0) == 10_000
+    assert frames_for_snr(100, 2.0, 4.0) == 2500
+    assert frames_for_snr(200, 2.0, 4.0) == 10_000
 
 
 def test_an_exposure_sees_the_rows_of_its_delay() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lowfc.arrays import Array
-from lowfc.control.calibration.excitation import FEWEST_CYCLES, build_staircase, lines, multisine, with_lead_in
+from lowfc.control.calibration.excitation import MIN_CYCLES_OF_LINE, build_staircase, lines, multisine, with_lead_in
 from lowfc.control.calibration.linearity import captured, gains, levels
 from lowfc.control.laws import margins
 from lowfc.control.laws.integrator import Integrator
@@ -145,7 +145,7 @@ def run_probe(setup: Settings, request: Request) -> tuple[Array, Array, State]:
 )
 def test_the_measured_rejection_agrees_with_theory(target: str, delay_frames: float) -> None:
     setup = settings(delay_frames=delay_frames, gain=GAIN)
-    places = lines(PERIOD, len(NOLL), 12, FEWEST_CYCLES / PERIOD, 0.3)
+    places = lines(PERIOD, len(NOLL), 12, MIN_CYCLES_OF_LINE / PERIOD, 0.3)
     period = multisine(PERIOD, places, 3.0, 1)
     lead = settling_frames(law().gain, law().leak)
     table = with_lead_in(period, lead)

@@ -103,7 +103,7 @@ class Pokes:
         request = self._request
         if request.cycles is not None:
             return request.cycles
-        frames = poke_plan.frames_for(request.snr / MARGIN, float(self.noise_nm.max()), self.amplitude_nm)
+        frames = poke_plan.frames_for_snr(request.snr / MARGIN, float(self.noise_nm.max()), self.amplitude_nm)
         return max(ceil(frames / self.cycle(0).per_column), MIN_CYCLES)
 
     def more_cycles(self, cycles: int, error: float) -> int:
