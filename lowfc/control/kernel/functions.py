@@ -1,7 +1,7 @@
 """The fused step: the arithmetic of a normal frame in plain functions, to be compiled.
 
 The functions suit a compiler: they loop over existing arrays, allocate nothing, and call only each other and simple
-functions of Python and numpy. Rows of R are processed ten at a time and the rest five at a time, so that each frame
+functions of Python and numpy. Rows of R are processed ten at a time and the rest five at a time, so that each pixel
 is read once for many rows and several sums run in parallel. `lowfc.adapters` compiles them.
 """
 
@@ -15,8 +15,9 @@ def scan(
 ) -> tuple[np.uint64, np.uint16]:
     """Products of one block of a frame with R, in one pass over its counts.
 
-    `counts`, `used` and `dark` are this block's part of `pixels`, `good` and `dark` in `measure`; the block's tiles
-    begin at `row`. The result, not yet normalised, is in `sums_nm` (modes rounded up to five,).
+    `counts`, `used` and `dark` are this block's part of `pixels`, `good` and `dark` in `measure`; `row` is the index of
+    the block's first row in `tiles`. The products, not yet normalised, are written to `sums_nm` (modes rounded up to
+    five,).
 
     Returns:
         Sum of the used counts, and the highest used count.
@@ -77,8 +78,8 @@ def measure_blocks(
 ) -> None:
     """`scan` the blocks from `first` to `last`, exclusive, so that several threads can share a frame.
 
-    The results are in `sums_nm` (blocks, modes rounded up to five) and `totals` (blocks, 2): sum of the used counts,
-    and the highest used count. Each thread has its own scratch; the rest is as in `measure`.
+    The results are written to `sums_nm` (blocks, modes rounded up to five) and `totals` (blocks, 2): sum of the used
+    counts, and the highest used count. Each thread has its own `scratch`; the other arguments are as in `measure`.
     """
     block = scratch.size
     for number in range(first, last):
@@ -110,8 +111,8 @@ def measure(
         dark: (pixels,) DN.
         tiles: (blocks x modes rounded up to five, block) R, one block of pixels after the other, padded with zeros.
         scratch: (block,) overwritten.
-        sums_nm: (blocks, modes rounded up to five) overwritten, or filled.
-        totals: (blocks, 2) overwritten, or filled.
+        sums_nm: (blocks, modes rounded up to five) overwritten, or the sums if `pixels` is empty.
+        totals: (blocks, 2) overwritten, or the totals if `pixels` is empty.
         reference_nm: (modes,) R I0.
         full_well: lowest count of a saturated pixel.
         dark_sum_dn: sum of the dark over the good pixels.
@@ -181,8 +182,8 @@ def respond(
         stroke_nm: largest deviation of an actuator from flat.
         slew_nm: largest move of an actuator.
         neighbour_nm: largest difference between neighbours.
-        results: (3 modes + states,) output: error less shift and target, pseudo-open-loop modes less shift, command
-            and x.
+        results: (3 modes + states,) output: error minus shift and target, pseudo-open-loop modes minus shift, command,
+            and the new x.
         actuators_nm: (rows, columns) output: actuators of the command, nm of surface.
 
     Returns:

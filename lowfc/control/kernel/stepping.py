@@ -71,7 +71,7 @@ def _fused(
     signals = measured_nm, seen_nm(loop.delay_weights, loop.history_nm), shift_nm, target_nm, loop.history_nm[0]
     integrator = loop.integrator.rows
     mirror = tables.shapes, channels_nm, loop.actuators_nm
-    # limits less the margin, which is half as large between neighbours
+    # The limits minus the margin; for the neighbour limit, half of the margin.
     limits_nm = limits.kept_stroke_nm, limits.kept_slew_nm, limits.neighbour_nm - limits.margin_nm / 2
     if not tables.respond(*signals, integrator, x, *matrices, from_error, *mirror, *limits_nm, results, actuators_nm):
         return None
@@ -110,13 +110,13 @@ def _update_guard(
     """The loop with its advanced law and guard; error and POL (modes,) are relative to the loop's target."""
     guard, channels, closed = advanced.guard, loop.command_channels, state.mode is LoopMode.CLOSED
     if guard is not None:
-        probed = state.returning_to_zero or (channels is not None and channels.play is not None)
+        not_by_law = state.returning_to_zero or (channels is not None and channels.play is not None)
         fading = closed and SETTLING_FRAMES < advanced.frames < SETTLING_FRAMES + FADING_FRAMES
-        if probed or fading or not (closed or state.mode is LoopMode.OPEN):
+        if not_by_law or fading or not (closed or state.mode is LoopMode.OPEN):
             guard = guard.at_rest()
         elif advanced.frames <= SETTLING_FRAMES or not closed:
             guard = guard.observed(pol_from_target_nm, advanced.frames)
-        else:  # a modal limit does not count: virtual commands have it, too, so that the comparison stays valid
+        else:  # a modal limit does not void the comparison, as virtual commands are limited in the same way
             limited = any(reason is not Limit.MODAL_LIMIT for reason in state.limits_hit)
             commands = advanced.law, advanced.x, loop.integrator, loop.delay_weights, loop.history_nm
             guard, guard_events = guard.judged(*commands, error_nm, pol_from_target_nm, limited=limited)

@@ -40,7 +40,7 @@ class Estimate(NamedTuple):
     flux_dn: float
 
     def same(self, other: "Estimate | None") -> bool:
-        """Whether both come from identical images, as from a stuck camera; photon noise makes real ones differ."""
+        """Whether both come from identical images, as from a stuck camera; photon noise makes real images differ."""
         return other is not None and self.flux_dn == other.flux_dn and np.array_equal(self.error_nm, other.error_nm)
 
 
@@ -105,7 +105,7 @@ class Tables(NamedTuple):
     def estimate(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
         """Estimate of a frame (pixels,), DN, by the fused step; None if the frame needs the reference step.
 
-        It does if a good pixel is saturated, or the flux is not above `min_flux_dn` plus the margin.
+        A frame needs it if a good pixel is saturated, or the flux is not above `min_flux_dn` plus the margin.
         """
         error_nm = np.empty_like(self.reference_nm)
         least_dn = min_flux_dn + self.margin_dn

@@ -9,7 +9,7 @@ from lowfc.control.laws.stability import highest_gain
 from lowfc.control.laws.virtual import VirtualIntegrators, Weights
 
 MIN_GAIN = 1e-3
-"""Lower limit of a bank's gains: they are the highest gain within the margins, halved repeatedly, and 0 in row 0."""
+"""Lower limit of a bank's gains above 0, which are the highest gain within the margins, halved repeatedly."""
 BLOCKS = 10
 """Blocks of a window, for the standard errors of its means."""
 CONFIDENCE = 2.0
@@ -18,14 +18,14 @@ since one block may outweigh all others when the open loop wanders."""
 WINNING_BLOCKS = 9
 GRANT_SIGMAS = 3.0
 """Standard errors of white noise by which a gain must beat the open loop, in a first window and later for a mode with a
-gain of 0: on a faint star, a single gain granted because of noise may add as much contrast as the dark zone has."""
+gain of 0. On a faint star, a single gain granted because of noise may add as much contrast as the dark zone has."""
 EARLY_BLOCKS = 5
-"""Blocks of a window after which a mode may get another gain before the window ends: from a gain of 0 if the other one
-is better by `GRANT_SIGMAS`, from the least gain if the other one was better in this many blocks in a row."""
+"""Number of blocks after which a mode may get another gain before its window ends: instead of 0, a gain that is better
+by `GRANT_SIGMAS`; instead of the least gain, a gain that was better in this many blocks in a row."""
 MAX_GROWTH = 16
 """Largest factor by which a window grows while it decides nothing."""
 MIN_MAJORITY_MODES = 3
-"""Number of modes below which each is judged by itself only; with more, the majority is evidence for each."""
+"""Least number of modes with which the majority is evidence for each; with fewer, each is judged by itself."""
 MAX_INJECTED = 0.1
 """Ratio of injected noise to correctable power below which a first window chooses the least gain instead of 0."""
 CERTAIN_SIGMAS = 4.0
@@ -49,11 +49,11 @@ class Verdict(NamedTuple):
         power_nm2: mean square of the open loop, with the noise of a frame and without the cross-talk of tip and tilt.
         noise_nm2: noise in `power_nm2`: as computed, or half the mean square of the change between frames if that is
             larger; None if it was not computed.
-        change_nm2: mean square with the current gain less that of the open loop; above 0, closing does harm.
+        change_nm2: mean square with the current gain minus that of the open loop; above 0, closing does harm.
         change_error_nm2: standard error of `change_nm2`.
-        loop_nm2: as `change_nm2`, of the real loop with any law; None if it was not closed throughout.
+        loop_nm2: as `change_nm2`, for the real loop with any law; None if it was not closed in the whole window.
         loop_error_nm2: standard error of `loop_nm2`.
-        frames: frames of the window.
+        frames: number of frames in the window.
     """
 
     gain: Single
@@ -91,7 +91,7 @@ class GainBank:
         self._distinct = np.diff(self.rows, axis=0, prepend=-1) > 0
         self._at_rest = VirtualIntegrators.at_rest(self.rows, 1 - leak, limit_nm, weights)
         self._windows = windows
-        self._closed = self._throughout = False
+        self._closed = self._closed_throughout = False
         self._waiting = 0  # frames in the arrays below that have not been summed
         self._errors_nm = np.zeros((FRAMES_PER_SUM, *self.rows.shape), np.float32)
         self._loop_nm = np.zeros((FRAMES_PER_SUM, leak.size), np.float32)
@@ -107,7 +107,7 @@ class GainBank:
         self.begin_first_window()
 
     def use_reconstructor(self, from_own: Array | Single) -> None:
-        """Expect modes of another R from now on: `from_own` (modes, modes) times those of the calibration's own R.
+        """Expect modes of another R from now on: `from_own` (modes, modes) times the modes of the calibration's own R.
 
         The cross-talk of tilt is fitted in the modes of the calibration's own R: another R mixes it into other modes.
         """
@@ -122,13 +122,13 @@ class GainBank:
     def add_frame(self, open_nm: Single, error_nm: Single, tilt_nm: Single | None = None, *, closed: bool) -> bool:
         """Add one frame: open-loop modes and the real loop's errors (modes,); return whether a block is complete.
 
-        A bank of modes other than tip and tilt also needs these two (2,), as the sensor saw them. A window that is not
-        a first one begins anew when the loop opens or closes.
+        A bank of modes other than tip and tilt also needs `tilt_nm`: tip and tilt (2,) as the sensor saw them. A window
+        that is not a first one begins anew when the loop opens or closes.
         """
         if closed is not self._closed and not self.first:
             self._add_up()
             self._clear(self._windows[1])
-        self._throughout = self._throughout and closed
+        self._closed_throughout = self._closed_throughout and closed
         self._closed = closed
         self._loops, self._errors_nm[self._waiting] = self._loops.advanced(open_nm)
         self._loop_nm[self._waiting] = error_nm
@@ -143,7 +143,7 @@ class GainBank:
         self._add_up()
         self._excesses.append(self._excess / self._frames)
         self._powers.append(self._power / self._frames)
-        self._changed.append(self._changes / max(self._changes_counted, 1))
+        self._noises.append(self._changes / max(self._changes_counted, 1))
         self._means.append(self._mean / self._frames)
         self._tilts.append(self._tilt / self._frames)
         self._spreads.append(self._spread / self._frames)
@@ -156,7 +156,7 @@ class GainBank:
         return len(self._excesses) == BLOCKS
 
     def early(self, gain: Single) -> Single:
-        """Gains (modes,) before the window is complete.
+        """Gains (modes,) to use before the window is complete, from the gains in use.
 
         A mode with a gain of 0 or the least gain gets a better one if there is one (see `EARLY_BLOCKS`). A mode whose
         signal proves to be cross-talk gets 0. All others keep their gains.
@@ -166,8 +166,8 @@ class GainBank:
         now = self._row_of(gain)
         cross_talk_nm, suspected_nm = self._cross_talk_nm(self._tilts[-EARLY_BLOCKS:])
         if (now > 1).all() and not cross_talk_nm.any():
-            return gain  # no mode can change: saves most of the time
-        blocks = self._handicapped(suspected_nm)[:, :-1]
+            return gain  # no mode can change: in most cases the rest is not computed
+        blocks = self._with_cross_talk_margin(suspected_nm)[:, :-1]
         own = blocks[:, now, np.arange(now.size)]
         beyond = blocks - own[:, None]
         mean = np.where(now == 0, beyond.mean(axis=0), beyond[-EARLY_BLOCKS:].mean(axis=0))
@@ -185,29 +185,29 @@ class GainBank:
         self._cross_talk.held()
 
     def verdict(self, gain: Single, noise_nm2: Array | None) -> Verdict:
-        """Result of the window at gains (modes,) with one frame's noise (modes,); then clear or lengthen the window."""
+        """Result of the window, for gains in use and a frame's noise (modes,); then clear or lengthen the window."""
         means, power = (np.mean(values, axis=0, dtype=float) for values in (self._means, self._powers))
         cross_talk_nm, suspected_nm = self._cross_talk_nm(self._tilts)
         power -= (2 * means - cross_talk_nm) * cross_talk_nm
         now = self._row_of(gain)
         modes = np.arange(gain.size)
         frames = self._block * BLOCKS
-        mean, error = _mean(self._without(cross_talk_nm))
-        chosen = self._chosen(self._handicapped(suspected_nm), now)
+        mean, error = _mean(self._without_cross_talk(cross_talk_nm))
+        chosen = self._chosen(self._with_cross_talk_margin(suspected_nm), now)
         if noise_nm2 is not None:
-            noise_nm2 = np.maximum(noise_nm2, np.mean(self._changed, axis=0))
+            noise_nm2 = np.maximum(noise_nm2, np.mean(self._noises, axis=0))
         if self.first and noise_nm2 is not None:
-            scatter = _mean(np.subtract(self._powers, self._changed))[1]  # noise of a faint star has long tails
+            scatter = _mean(np.subtract(self._powers, self._noises))[1]  # noise of a faint star has long tails
             certain_power = power - noise_nm2 - GRANT_SIGMAS * np.maximum(noise_nm2 * np.sqrt(2 / frames), scatter)
-            little = injected(self.rows[1]) * noise_nm2 < MAX_INJECTED * certain_power
-            chosen = np.where((chosen == 0) & little & (suspected_nm == 0), 1, chosen)
+            injects_little = injected_fraction(self.rows[1]) * noise_nm2 < MAX_INJECTED * certain_power
+            chosen = np.where((chosen == 0) & injects_little & (suspected_nm == 0), 1, chosen)
         verdict = Verdict(
             self.rows[chosen, modes],
             power,
             noise_nm2,
             mean[now, modes],
             error[now, modes],
-            mean[-1] if self._throughout else None,
+            mean[-1] if self._closed_throughout else None,
             error[-1],
             frames,
         )
@@ -226,39 +226,39 @@ class GainBank:
         ]
         return [self._from_own @ cross_talk_nm for cross_talk_nm in accepted]
 
-    def _without(self, cross_talk_nm: Array) -> Array:
-        """Mean squares of the true modes less those in open loop (blocks, rows and the real loop, modes), nm^2.
+    def _without_cross_talk(self, cross_talk_nm: Array) -> Array:
+        """Mean squares of the true modes minus those in open loop (blocks, rows and the real loop, modes), nm^2.
 
-        Cross-talk (modes,) is measured but not real: a loop of any gain but 0 puts it on the mirror and then no longer
-        measures it.
+        Cross-talk (modes,) is measured but not real: a loop with a gain above 0 puts it on the mirror, and then no
+        longer measures it.
         """
         blocks = np.array(self._excesses, float)
         blocks[:, 1:] += (2 * np.array(self._means, float) * cross_talk_nm)[:, None]
         return blocks
 
-    def _handicapped(self, cross_talk_nm: Array) -> Array:
-        """As `_without`, but cross-talk (modes,) counts `MARGIN` times if it speaks against a gain, else not at all."""
+    def _with_cross_talk_margin(self, cross_talk_nm: Array) -> Array:
+        """As `_without_cross_talk`; cross-talk (modes,) counts `MARGIN` times if it is against a gain, else 0 times."""
         against = np.mean(self._means, axis=0) * cross_talk_nm > 0
-        return self._without(np.where(against, MARGIN * cross_talk_nm, 0))
+        return self._without_cross_talk(np.where(against, MARGIN * cross_talk_nm, 0))
 
     def _chosen(self, blocks: Array, now: Integers) -> Integers:
         """Best row (modes,) of each mode whose current row is `now`."""
-        own, modes = blocks[:, :-1], np.arange(now.size)
-        rows, helps = own + self._median_of_modes(own), (own.mean(axis=0) < 0) & self._distinct
+        virtual, modes = blocks[:, :-1], np.arange(now.size)
+        rows, helps = virtual + self._median_of_modes(virtual), (virtual.mean(axis=0) < 0) & self._distinct
         if self.first:
             beyond_open = rows.mean(axis=0)
             better = helps & self._beyond_noise(beyond_open)
             return np.where(better.any(axis=0), np.argmin(np.where(better, beyond_open, np.inf), axis=0), 0)
         beyond_now, better = _better(rows - rows[:, now, modes][:, None])
         better = helps & np.where(now == 0, self._beyond_noise(beyond_now), better)
-        better[0] = _better(-own)[1][now, modes]
+        better[0] = _better(-virtual)[1][now, modes]
         best = np.argmin(np.where(better, beyond_now, np.inf), axis=0)
         best = np.where(better.any(axis=0), best, now)
         near = np.clip(best, np.maximum(now - 1, 0), now + 1)
         return np.where((now <= 1) | better[0], best, near)
 
     def _beyond_noise(self, mean: Array) -> Mask:
-        """Whether a mean over the blocks (rows, modes), less that of gain 0, is lower than white noise explains.
+        """Whether a mean over the blocks minus that of gain 0 (rows, modes) is lower than white noise explains.
 
         Commands do not depend on the noise of later frames, so the differences of frames are independent.
         """
@@ -270,7 +270,7 @@ class GainBank:
         """Median over the modes of value / noise, times each mode's noise; 0 below `MIN_MAJORITY_MODES` modes."""
         if blocks.shape[-1] < MIN_MAJORITY_MODES:
             return np.zeros_like(blocks)
-        noise_nm2 = np.maximum(np.mean(self._changed, axis=0), 1e-12)
+        noise_nm2 = np.maximum(np.mean(self._noises, axis=0), 1e-12)
         return np.asarray(np.median(blocks / noise_nm2, axis=-1, keepdims=True) * noise_nm2)
 
     def _row_of(self, gain: Single) -> Integers:
@@ -303,8 +303,8 @@ class GainBank:
         self._block = max(window // BLOCKS, 1)
         self._longest = self._block * MAX_GROWTH
         self._lists = tuple(list[Array]() for _ in range(6))
-        self._excesses, self._powers, self._changed, self._means, self._tilts, self._spreads = self._lists
-        self._throughout = True
+        self._excesses, self._powers, self._noises, self._means, self._tilts, self._spreads = self._lists
+        self._closed_throughout = True
         self._begin_block()
 
     def _begin_block(self) -> None:
@@ -334,7 +334,7 @@ class TiltCrossTalk:
     """
 
     def __init__(self, modes: int) -> None:
-        """Start with this number of other modes."""
+        """Start without frames; `modes` is the number of other modes."""
         self._products = np.zeros((_REGRESSORS, _REGRESSORS + modes))
         self._powers = np.zeros(modes)
         self._changes = 0
@@ -383,7 +383,7 @@ def _better(blocks: Array) -> tuple[Array, Mask]:
     return mean, (mean < -CONFIDENCE * error) | ((mean < 0) & (np.sum(blocks < 0, axis=0) >= WINNING_BLOCKS))
 
 
-def injected(gain: Single) -> Single:
+def injected_fraction(gain: Single) -> Single:
     """Fraction (modes,) of a frame's noise variance that an integrator puts on the mirror, for a delay of one frame."""
     return gain / (2 - gain)
 

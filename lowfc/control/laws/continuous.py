@@ -1,9 +1,9 @@
 """Residual wavefront of a loop in continuous time, not only at one instant of each frame.
 
 The star moves while the mirror holds. A wave e^(i w t) is measured as m e^(i w t_k), its mean over the exposure that
-starts at t_k; the command computed from it is in force from a to a + 1 periods after t_k, where the wave has the mean
-h e^(i w (t_k + a)).
-The command follows from the sampled loop; the residual has a floor, `1 - |h|^2`, that no command can remove.
+starts at t_k. The command computed from it is in force from a to a + 1 periods after t_k; the mean of the wave in this
+time is h e^(i w (t_k + a)). The command follows from the sampled loop; the residual has a floor, `1 - |h|^2`, that no
+command can remove.
 
 Frequencies are in rad per frame and may exceed pi, where the sampled loop sees the alias.
 """
@@ -31,7 +31,7 @@ class Timing(NamedTuple):
 
     Attributes:
         delay: in frames; a command computed from frame n first acts on the whole exposure of frame n + delay.
-        applied: from the start of an exposure until the command computed from it is in force.
+        applied: time from the start of an exposure until the command computed from it is in force.
         exposure: length of an exposure; 0 for an instant.
         held: time over which the residual counts, from `applied` on: a period, or 0 for that instant alone.
     """
@@ -55,7 +55,8 @@ class Timing(NamedTuple):
         """Timing in which a command is in force `waited` periods after the end of its frame's exposure.
 
         The whole periods follow from `delay`, the fraction of a period from `exposure + waited`. The result is that of
-        `of` for a fractional delay, or if the command would be in force by the end of the exposure or after the delay.
+        `of` if the delay is fractional, or if the command is in force by the end of the exposure or only after the
+        delay.
         """
         after = exposure + waited
         if delay != round(delay) or not exposure < after <= delay:
@@ -116,7 +117,7 @@ def residual_spectrum(law: LinearLaw, omega: Array, measured: Array, noise_nm2: 
 
 
 def commanded(law: LinearLaw, omega: Array, delay: float) -> Complex:
-    """Command (frequencies, modes) from a frame that measures e^(i w t_k), relative to it; omega in rad per frame."""
+    """Command (frequencies, modes) from a frame that measures e^(i w t_k), relative to this; omega in rad per frame."""
     return _commanded(sensitivity(law, omega, delay), omega, delay)
 
 
@@ -133,8 +134,8 @@ def means_while_applied(measured_nm: Array, timing: Timing) -> tuple[Array, Comp
         timing: the loop's timing.
 
     Returns:
-        (frames, modes), NaN where there are too few neighbours; and the filter's response (frequencies,) at
-        `_FILTER_OMEGA`, for the noise.
+        The means (frames, modes), NaN where there are too few neighbours; and the filter's response (frequencies,) at
+        `_FILTER_OMEGA`, from which the noise of the means follows.
     """
     lags, taps, response = _filter(timing)
     means_nm = np.full(measured_nm.shape, np.nan)

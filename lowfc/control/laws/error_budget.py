@@ -17,7 +17,7 @@ from lowfc.control.laws.margins import noise_gain, noise_transfer, rejection
 from lowfc.control.laws.spectra import Spectrum, TimeSeries, floor_nm2_hz, spectrum
 
 ROWS_PER_REGRESSOR = 10
-"""Least number of frames per regressor; with fewer a fit mostly explains noise."""
+"""Least number of frames for each regressor; with fewer, a fit mostly explains noise."""
 DETECTED_SIGMAS = 2.0
 """Standard errors above which a difference of two variances counts as detected."""
 
@@ -32,7 +32,7 @@ class Term:
     error_nm2: Array | float = 0.0
 
     def total(self, modes: Mask) -> tuple[float, bool]:
-        """Rms in nm over some of the modes (modes,), and whether it was detected: otherwise it is an upper limit."""
+        """Rms in nm of some of the modes (modes,), and whether it was detected; if not, the rms is an upper limit."""
         variance = float(self.variance_nm2[modes].sum())
         error = float(np.sqrt((np.broadcast_to(self.error_nm2, self.variance_nm2.shape)[modes] ** 2).sum()))
         if error == 0 or variance > DETECTED_SIGMAS * error:
@@ -76,7 +76,7 @@ def white_noise(law: LinearLaw, noise_nm: Array, timing: Timing) -> Term:
 
 
 def lag(law: LinearLaw, disturbance: Spectrum, mean_nm: Array, timing: Timing) -> Term:
-    """Residual of a disturbance, from spectrum and mean (modes,) of its values at the start of each exposure.
+    """Residual of a disturbance, from the spectrum and the mean (modes,) of its values at the starts of exposures.
 
     The residual is a mean over all time, or over the starts of exposures if `timing.held` is 0.
     """
@@ -84,7 +84,7 @@ def lag(law: LinearLaw, disturbance: Spectrum, mean_nm: Array, timing: Timing) -
 
 
 def lag_under_noise(law: LinearLaw, measured: Spectrum, mean_nm: Array, timing: Timing) -> Term:
-    """As `lag`, from spectrum and mean (modes,) of the measurements, which are means over exposures with white noise.
+    """As `lag`, from spectrum and mean (modes,) of measurements: means over exposures, plus white noise.
 
     The noise, the floor of the spectrum, is subtracted.
     """

@@ -9,8 +9,8 @@ from lowfc.arrays import Mask, Single, single
 TIP_TILT = (2, 3)
 """Noll indices of tip and tilt, whose gains are set and judged separately from those of the other modes."""
 RELAXING = np.float32(0.99)
-"""Largest fraction of its command that a mode keeps per frame while its automatic gain is 0, since nothing corrects
-what an earlier gain put on the mirror."""
+"""Largest fraction of its command that a mode keeps from frame to frame while its automatic gain is 0: without a gain,
+nothing else removes what an earlier gain put on the mirror."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +49,9 @@ class Integrator:
 
 
 def integrate(integrator: Integrator, command_nm: Single, error_nm: Single) -> tuple[Single, bool]:
-    """The next command, kept * command - gain * error, clipped to each mode's limit; and whether any was clipped.
+    """The next command, kept * command - gain * error, clipped to each mode's limit; and whether any mode was clipped.
 
-    All (modes,) float32, nm of wavefront rms.
+    All arrays are (modes,) float32, nm of wavefront rms.
     """
     next_nm = integrator.kept * command_nm - integrator.gain * error_nm
     if np.count_nonzero(np.abs(next_nm) > integrator.limit_nm):

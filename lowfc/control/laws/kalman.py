@@ -13,11 +13,11 @@ from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.linear_law import Block, LinearLaw, law_from_blocks
 from lowfc.control.laws.vibration import Model
 
-_DOUBLINGS = 40  # largest number of iterations
+_DOUBLINGS = 40  # largest number of iterations, each of which doubles the number of filtered frames
 
 
 def lqg(models: Sequence[Model], noll: tuple[int, ...], timing: Timing) -> LinearLaw:
-    """The law from one model for each mode, if a frame measures the mean of a mode over the exposure.
+    """The law from one model for each mode, for frames that measure the mean of each mode over the exposure.
 
     Raises:
         ValueError: the numbers of models and modes differ, models have different rates, or a filter does not converge.
@@ -63,5 +63,5 @@ def covariance_nm2(model: Model) -> Array:
         if np.abs(grown).max() <= 1e-12 * np.abs(X).max():
             return model.noise_nm2 * np.asarray(X)
     raise ValueError(
-        f"no Kalman filter settles within {2**_DOUBLINGS} frames: drift or line far below the noise, or no noise"
+        f"no Kalman filter settles within {2**_DOUBLINGS} frames: drift or lines are far below the noise, or it is zero"
     )

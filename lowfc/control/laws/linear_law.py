@@ -13,7 +13,7 @@ from lowfc.control.laws.stability import delay_weights
 Signal = Literal["error", "pol"]
 
 _LARGEST_POLE = 0.99
-"""Largest pole of an integrator with signal pol, in an open loop while frames are missing: below 1, for stability."""
+"""Largest pole of an integrator of POL modes in an open loop while frames are missing; below 1, for stability."""
 MAX_STATES = 512
 """Most states of a law: a step with this number takes about 50 us."""
 SIGNALS: tuple[Signal, ...] = ("error", "pol")
@@ -80,7 +80,7 @@ def matrix_shapes(states: int, modes: int) -> dict[str, tuple[int, int]]:
     return {"transition": square, "measurement_gain": in_, "command_gain": in_, "predict_only": square, "output": out}
 
 
-# The hashed names are those of 0.1, so that laws keep their identities.
+# The hashed names are those of release 0.1, so that laws keep their identities.
 _IDENTITY = (
     ("signal", "signal"),
     ("follow", "transition"),
@@ -98,7 +98,7 @@ def at_rest(law: LinearLaw) -> Single:
 
 def predict_and_update(law: LinearLaw, x: Single, y: Single, command_nm: Single) -> Single:
     """The state (states,) after a frame, from its y (modes,), nm, and the last command after limits (modes,)."""
-    after: Single = law.transition.dot(x)  # half a microsecond less than `@`
+    after: Single = law.transition.dot(x)  # takes half a microsecond less than `@`
     after += law.measurement_gain.dot(y)
     after += law.command_gain.dot(command_nm)
     return after
@@ -152,7 +152,7 @@ def law_from_blocks(
 def integrator_block(gain: float, leak: float, signal: Signal, delay_frames: float) -> Block:
     """The integrator c[k] = (1 - leak) c[k-1] - gain e[k], from the error or from pseudo-open-loop modes.
 
-    From the latter, e[k] = pol[k] + sum_j w_j c[k-1-j], for which the block stores commands. During missing frames pol
+    With signal pol, e[k] = pol[k] + sum_j w_j c[k-1-j], for which the block stores commands. During missing frames pol
     is predicted to cancel the stored commands, so that the command keeps its value, apart from the leak. Above a gain
     of 0.99 / w_0 this prediction would be unstable in an open loop, so it is damped: the command then undoes part of
     its last change, at most a quarter at gains that keep the margins.

@@ -38,7 +38,7 @@ class Margins:
         gain_margin: factor by which the loop's gain may grow; infinite if there is no bound.
         gain_reduction: factor above which the gain must stay; 0 if there is no bound.
         phase_margin_deg: additional phase lag at which the loop oscillates; 180 if the loop never has a gain of 1.
-        peak: largest `|S|`: 1 over the modulus margin, the least distance of L from -1.
+        peak: largest `|S|`, the inverse of the modulus margin (the least distance of L from -1).
     """
 
     radius: Array
@@ -105,7 +105,7 @@ def check_stable(law: LinearLaw, delay_frames: float) -> None:
     The check needs only poles, and takes a fraction of the time of `margins`.
 
     Raises:
-        ValueError: it is unstable (the message has the pole), or more than `MAX_COUPLED_STATES` states are coupled.
+        ValueError: the law is unstable (the text names the pole), or more than `MAX_COUPLED_STATES` states are coupled.
     """
     weights = delay_weights(delay_frames)
     for part in _parts(law):
@@ -146,7 +146,7 @@ def noise_transfer(law: LinearLaw, frequency_hz: Array, delay_frames: float | No
 
 
 def noise_gain(law: LinearLaw, delay_frames: float | None = None, *, held: bool = False) -> Array:
-    """Residual variance (modes,) caused by white measurement noise, per variance of that noise in one frame.
+    """Residual variance (modes,) caused by white measurement noise, divided by the variance of that noise in one frame.
 
     The residual is averaged over exposures, which see a mean of two commands if the delay is fractional; with `held`,
     it is averaged over all time.
@@ -170,11 +170,11 @@ def _weights(law: LinearLaw, delay_frames: float | None) -> Array:
 def sensitivity(law: LinearLaw, omega: Array, delay_frames: float | None = None) -> Complex:
     """Complex S (frequencies, modes) of each mode, at frequencies in rad per frame."""
     weights, omega = _weights(law, delay_frames), np.maximum(omega, _LOWEST)
-    of_modes = np.ones((omega.size, len(law.noll)), complex)
+    of_all_modes = np.ones((omega.size, len(law.noll)), complex)
     for part in _parts(law):
         S = part.sensitivity(omega, weights)
-        of_modes[:, part.modes] = np.einsum("fmm->fm", S)
-    return of_modes
+        of_all_modes[:, part.modes] = np.einsum("fmm->fm", S)
+    return of_all_modes
 
 
 @dataclass(frozen=True, slots=True)

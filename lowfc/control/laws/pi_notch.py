@@ -1,4 +1,4 @@
-"""PI laws, leaky or not, with notches in their rejection: each is a resonator that removes one line."""
+"""PI laws, leaky or not, with notches in their rejection: each notch is a resonator that removes one line."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,14 +12,14 @@ from lowfc.control.laws.stability import delay_weights
 
 _EXACT = 1e-6  # noise variance of the limited commands in `_correction`; the Riccati equation needs one above 0
 _UNKNOWN = 1e-3
-"""Variance of unknown changes of the states in `_correction`: a larger one delays the return from a limit, with a
-smaller one wrong states last longer."""
+"""Variance of unknown changes of the states in `_correction`: with a larger value, the return from a limit takes
+longer; with a smaller one, wrong states last longer."""
 
 
 class Notch(NamedTuple):
     """A notch: at `frequency_hz`, the rejection is divided by `depth`.
 
-    `width_hz` is the width between its -3 dB points if the notch is deep (at a depth of 4, that width is 6 % smaller).
+    `width_hz` is the width between its -3 dB points if the notch is deep (at a depth of 4, they are 6 % closer).
     Neighbouring notches deepen each other.
     """
 

@@ -1,4 +1,4 @@
-"""Power spectra of modes with missing frames: short gaps are interpolated, long ones split a run into pieces."""
+"""Power spectra of modes with missing frames: short gaps are interpolated, long gaps split a series into pieces."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ _SEGMENT_SHARE = 4  # the longest piece is at least this many segments long, unl
 
 @dataclass(frozen=True, slots=True)
 class TimeSeries:
-    """Evenly sampled time series of a run, in pieces without gaps.
+    """Evenly sampled time series, in pieces without gaps.
 
     Attributes:
-        values: pieces, (frames, columns) each.
-        interpolated: number of interpolated frames among them.
+        values: the pieces, each (frames, columns).
+        interpolated: number of interpolated frames in all pieces.
     """
 
     values: tuple[Array, ...]
@@ -31,16 +31,16 @@ class TimeSeries:
 
     @property
     def frames(self) -> int:
-        """Frames of all pieces."""
+        """Number of frames in all pieces."""
         return sum(len(piece) for piece in self.values)
 
     @property
     def longest(self) -> int:
-        """Frames of the longest piece; 0 without pieces."""
+        """Number of frames in the longest piece; 0 without pieces."""
         return max((len(piece) for piece in self.values), default=0)
 
     def columns(self, which: slice) -> "TimeSeries":
-        """The same frames, some of the columns."""
+        """A series of the same frames with only these columns."""
         return TimeSeries(tuple(piece[:, which] for piece in self.values), self.interpolated)
 
     def joined(self) -> Array:
@@ -82,7 +82,7 @@ class Spectrum:
 
 
 def time_series(sequence: Sequences, values: npt.NDArray[np.floating]) -> TimeSeries:
-    """Time series of a run, split into evenly sampled pieces at long gaps.
+    """Time series of the rows of a log, split into evenly sampled pieces at long gaps.
 
     Args:
         sequence: (rows,) sequence of each row's frame; rows that do not increase it are ignored. A change of the
@@ -108,18 +108,18 @@ def time_series(sequence: Sequences, values: npt.NDArray[np.floating]) -> TimeSe
     return TimeSeries(tuple(pieces), int(missing[missing <= MAX_INTERPOLATED_FRAMES].sum()))
 
 
-def spectrum(run: TimeSeries, rate_hz: float, frames: int = 0) -> Spectrum | None:
-    """Welch's estimate over all pieces of at least a segment; None if there are none.
+def spectrum(series: TimeSeries, rate_hz: float, frames: int = 0) -> Spectrum | None:
+    """Welch's estimate over all pieces with at least a segment; None if there are none.
 
-    Each segment's mean is subtracted, and Hann's window applied. A segment has `frames` frames, or if 0, a power of two
-    that follows from the longest piece. As `scipy.signal.welch`, whose import takes half a second.
+    Each segment's mean is subtracted, and Hann's window applied. A segment has `frames` frames or, if this is 0, a
+    power of two that follows from the longest piece. `scipy.signal.welch` is not used: its import takes half a second.
     """
-    if run.longest < SHORTEST:
+    if series.longest < SHORTEST:
         return None
-    frames = frames or min(LONGEST, max(SHORTEST, 1 << ((run.longest // _SEGMENT_SHARE).bit_length() - 1)))
+    frames = frames or min(LONGEST, max(SHORTEST, 1 << ((series.longest // _SEGMENT_SHARE).bit_length() - 1)))
     window = 0.5 + 0.5 * np.cos(np.linspace(-np.pi, np.pi, frames + 1)[:-1])
-    total, segments = np.zeros((run.values[0].shape[1], frames // 2 + 1)), 0
-    for piece in run.values:
+    total, segments = np.zeros((series.values[0].shape[1], frames // 2 + 1)), 0
+    for piece in series.values:
         if len(piece) >= frames:
             columns = np.ascontiguousarray(piece.T, np.float64)
             parts = np.lib.stride_tricks.sliding_window_view(columns, frames, axis=-1)[:, :: frames // 2]
@@ -131,7 +131,7 @@ def spectrum(run: TimeSeries, rate_hz: float, frames: int = 0) -> Spectrum | Non
 
 
 def floor_nm2_hz(found: Spectrum) -> Array:
-    """Level (columns,) of white noise: the median over the upper half of the frequencies, its bias removed.
+    """Level (columns,) of white noise: the median over the upper half of the frequencies, without the median's bias.
 
     A median of chi-squared values lies below their mean; lines and slopes of the disturbance hardly move it.
     """
@@ -141,7 +141,7 @@ def floor_nm2_hz(found: Spectrum) -> Array:
 
 
 def in_bins(frequency_hz: Array, columns: Sequence[Array]) -> tuple[Array, list[Array]]:
-    """Means of the frequencies and of each column over twenty bins per decade of frequency, without 0 Hz.
+    """Means of the frequencies and of each column in bins, twenty per decade of frequency, without 0 Hz.
 
     Columns are (frequencies,), and their means (bins,).
     """

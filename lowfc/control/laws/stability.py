@@ -10,7 +10,7 @@ import numpy as np
 
 from lowfc.arrays import Array, Complex, Single
 
-MIN_GAIN_MARGIN = 1.8
+MIN_GAIN_MARGIN = 1.8  # factor by which the gain may grow
 MIN_PHASE_MARGIN_DEG = 45.0
 LOWEST_GAIN = 0.01
 """Least gain that `lowfc tune` chooses, so that even a mode whose drift is hidden by a log's noise is corrected."""
@@ -23,7 +23,7 @@ _BISECTIONS = 50
 
 
 def settling_frames(gain: Array | Single, leak: Array | Single, least: float = 0.0) -> int:
-    """Frames until the slowest mode has settled after closing, at least `least`; gain, leak (modes,) without unit."""
+    """Frames from closing until the slowest mode has settled, at least `least`; gain, leak (modes,) without unit."""
     slowest = float((gain + leak)[gain + leak > 0].min(initial=1.0))
     return int(np.ceil(max(SETTLING / slowest, least)))
 

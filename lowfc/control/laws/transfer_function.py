@@ -12,12 +12,12 @@ import numpy as np
 from lowfc.arrays import Array, Complex, Integers, Mask
 
 _FAINTEST = 1e-3  # amplitude of a line, relative to the mode's highest; fainter ones are rounding to single precision
-_ADJACENT = np.array([*range(-16, -1), *range(2, 17)])  # bins from which a line's noise is measured
-_BIN_TO_FLANK = 12 / 7  # ratio of a bin's white noise power under Hann's window to that of `flanks`, without the line
+_ADJACENT = np.array([*range(-16, -1), *range(2, 17)])  # bins, relative to a line's, from which its noise is measured
+_BIN_TO_FLANK = 12 / 7  # ratio of white noise powers under Hann's window: of a bin to that of `flanks`
 _DB = 20 / np.log(10)
 
 SIGMAS = 3.5
-"""Standard errors that must fit into the tolerance for a line to be judged."""
+"""A line is judged if this number of standard errors is within the tolerance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class Lines:
     """The lines of all modes, ascending within each mode.
 
     Attributes:
-        mode: (lines,) index of its mode.
+        mode: (lines,) index of the mode of each line.
         frequency: (lines,) cycles per frame.
         rejection: (lines,) S, complex.
         error: (lines,) standard error of the real part of S, and of its imaginary part.

@@ -20,12 +20,12 @@ from lowfc.control.laws.pi_notch import Notch, pi_notch
 from lowfc.control.laws.spectra import TimeSeries, floor_nm2_hz, spectrum
 from lowfc.control.laws.stability import LOWEST_GAIN, MIN_GAIN_MARGIN, MIN_PHASE_MARGIN_DEG, delay_weights, highest_gain
 from lowfc.control.laws.vibration import FEWEST, Model, identify, resolution_hz
-from lowfc.control.laws.what_if import counterfactual, driven_by
+from lowfc.control.laws.what_if import controller_of, counterfactual
 
-_NARROWER = (0.1, 0.01, 1e-3)  # factors tried on the fitted width of a line that a log cannot resolve
+_NARROWER = (0.1, 0.01, 1e-3)  # factors tried for the fitted width of a line that a log cannot resolve
 _WIDER = (10.0,)  # factors tried for lines that move
-_SETTLING_FRAMES = 5000
-_OCTAVES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # log2 of factors on the noise, tried until the margins suffice
+_SETTLING_FRAMES = 5000  # largest number of frames of a piece in which a simulated law settles
+_OCTAVES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # log2 of factors tried on the noise until the margins suffice
 _NEAR_ENOUGH = 0.25
 """Width of the bracket, in octaves of noise, at which the search for sufficient margins ends. The residuals of the
 filters at its two ends agree within half a percent."""
@@ -67,14 +67,14 @@ class Gains:
     noise_nm: Array
 
 
-def best_gains(run: TimeSeries, rate_hz: float, timing: Timing, leak: Array) -> Gains:
+def best_gains(series: TimeSeries, rate_hz: float, timing: Timing, leak: Array) -> Gains:
     """The gain of each mode with the least true residual of an integrator (after Gendron and Lena 1994).
 
     Args:
-        run: (frames, modes) of pseudo-open-loop modes, in pieces.
+        series: Pieces (frames, modes) of pseudo-open-loop modes, nm.
         rate_hz: Frame rate.
         timing: The loop's true timing.
-        leak: (modes,) of the integrators.
+        leak: (modes,) leak of each integrator.
 
     Raises:
         ValueError: there are too few consecutive frames.
@@ -82,21 +82,21 @@ def best_gains(run: TimeSeries, rate_hz: float, timing: Timing, leak: Array) -> 
     from scipy.optimize import minimize_scalar
 
     # Coarse segments would lose a slow mode's drift.
-    fine, coarse = spectrum(run, rate_hz, run.longest), spectrum(run, rate_hz)
-    if fine is None or coarse is None or run.longest < FEWEST:
-        raise ValueError(f"a law needs at least {FEWEST} consecutive frames, the longest piece has {run.longest}")
+    fine, coarse = spectrum(series, rate_hz, series.longest), spectrum(series, rate_hz)
+    if fine is None or coarse is None or series.longest < FEWEST:
+        raise ValueError(f"a law needs at least {FEWEST} consecutive frames, the longest piece has {series.longest}")
     noise_nm2 = floor_nm2_hz(coarse) * rate_hz / 2
     omega = 2 * np.pi * fine.frequency_hz[1:] / rate_hz  # an integrator without leak has no value at 0 Hz
     measured = fine.power_nm2_hz[1:] * rate_hz / 2
     leaks: list[float] = leak.tolist()
-    means_nm = [float(max(run.values, key=len)[:, mode].mean()) for mode in range(len(leaks))]
+    means_nm = [float(max(series.values, key=len)[:, mode].mean()) for mode in range(len(leaks))]
     gains, residual_nm2, sensed_nm2 = np.zeros((3, len(leaks)))
 
     def law_of(gain: float, mode: int) -> LinearLaw:
         return integrator([gain], [leaks[mode]], (2,), timing.delay, rate_hz)  # the Noll index does not matter
 
     def steady_nm2(gain: float, mode: int) -> float:
-        """A leak leaves a fraction of the mean: |S| at 0 Hz."""
+        """Square of what a leak leaves of the mean: the fraction |S| at 0 Hz."""
         return means_nm[mode] ** 2 * (leaks[mode] / (leaks[mode] + gain)) ** 2
 
     def residual(gain: float, mode: int) -> float:
@@ -114,15 +114,15 @@ def best_gains(run: TimeSeries, rate_hz: float, timing: Timing, leak: Array) -> 
     return Gains(gains, *rms)
 
 
-def identify_modes(run: TimeSeries, rate_hz: float) -> list[Model]:
+def identify_modes(series: TimeSeries, rate_hz: float) -> list[Model]:
     """A model of each mode of pseudo-open-loop modes (frames, modes).
 
     Raises:
         ValueError: there are too few consecutive frames.
     """
     models = []
-    for mode in range(run.values[0].shape[1] if run.values else 0):
-        model = identify(run.columns(slice(mode, mode + 1)), rate_hz)
+    for mode in range(series.values[0].shape[1] if series.values else 0):
+        model = identify(series.columns(slice(mode, mode + 1)), rate_hz)
         if model is None:
             raise ValueError(f"a model is fitted to at least {FEWEST} frames in a row, there are fewer")
         models.append(model)
@@ -136,23 +136,23 @@ def tune_integrator(models: Sequence[Model], gains: Gains, noll: tuple[int, ...]
 
 
 def tune_lqg(
-    run: TimeSeries, models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing
+    series: TimeSeries, models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing
 ) -> Tuned:
     """LQG for modes in which it beats the best integrator, else that integrator; leaks (modes,) without unit.
 
-    Several widths are tried on the run for lines that the spectrum does not resolve; a large one suits a moving line.
+    Several widths are tried on the series for lines that the spectrum does not resolve; a large one suits moving lines.
 
     Raises:
         ValueError: a filter does not converge, or the law is unstable.
     """
-    rate_hz, finest_hz = models[0].rate_hz, resolution_hz(run, models[0].rate_hz)
+    rate_hz, finest_hz = models[0].rate_hz, resolution_hz(series, models[0].rate_hz)
     noise_nm2 = np.array([model.noise_nm2 for model in models])
 
     def law_of(blocks: Sequence[Block]) -> LinearLaw:
         return law_from_blocks(blocks, "pol", "lqg", noll, timing.delay, rate_hz)
 
     def residual(blocks: Sequence[Block]) -> Array:
-        return simulated_residual_nm2(law_of(blocks), run, noise_nm2, timing)
+        return simulated_residual_nm2(law_of(blocks), series, noise_nm2, timing)
 
     scaled = ([_scaled(model, factor, finest_hz) for model in models] for factor in (*_NARROWER, *_WIDER))
     tried = [models, *scaled]
@@ -240,19 +240,19 @@ def frame_noise_nm2(models: Sequence[Model], noise_nm2: Array) -> Array:
     return np.asarray(noise_nm2 * np.outer(scale, scale))
 
 
-def simulated_residual_nm2(law: LinearLaw, run: TimeSeries, noise_nm2: Array, timing: Timing) -> Array:
+def simulated_residual_nm2(law: LinearLaw, series: TimeSeries, noise_nm2: Array, timing: Timing) -> Array:
     """Mean square (modes,) of the residual, averaged over the time in which each command is in force.
 
-    Changes within that period, which no law can remove, are not included. Each piece of the run, (frames, modes)
-    of pseudo-open-loop modes with noise (modes,), starts with a law at rest and a flat mirror; its first 5000 frames,
-    or its first third if that is shorter, do not count.
+    Changes within that time, which no law can remove, are not included. Each piece (frames, modes) of the series of
+    pseudo-open-loop modes, with noise (modes,), starts with a law at rest and a flat mirror; its first 5000 frames, or
+    its first third if that is shorter, do not count.
     """
     weights = delay_weights(timing.delay).astype(np.float32)
     squares, frames = np.zeros(len(law.noll)), 0
-    for piece in run.values:
+    for piece in series.values:
         skipped = min(_SETTLING_FRAMES, len(piece) // 3)
         missing = np.zeros(len(piece), np.int64)
-        command_nm = counterfactual(driven_by(law), weights, piece.astype(np.float32), missing)[1]
+        command_nm = counterfactual(controller_of(law), weights, piece.astype(np.float32), missing)[1]
         measured_nm, commanded_nm = piece[skipped:].astype(np.float64), command_nm[skipped:].astype(np.float64)
         piece_squares, piece_frames = held_residual_nm2(law, measured_nm, commanded_nm, noise_nm2, timing)
         squares, frames = squares + piece_squares, frames + piece_frames

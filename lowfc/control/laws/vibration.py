@@ -16,18 +16,18 @@ from lowfc.arrays import Array
 from lowfc.control.laws.spectra import TimeSeries
 
 FEWEST = 2048
-"""Least frames in a row for a fit."""
+"""Least number of consecutive frames for a fit."""
 
 _LONGEST = 1 << 16  # frames of a segment
 _MAX_LINES = 12
 _SCALES = (3, 9, 27, 81)  # numbers of frequencies over which lines are searched
-_PENALTY = 2.5  # log-likelihood per line and log(frequencies): 1.5 for 3 parameters (BIC), 1 for choosing a frequency
-_SHARE = 0.3  # part of the largest gain in likelihood that a narrower line must reach to be preferred
+_PENALTY = 2.5  # of a line, times log(frequencies): 1.5 for 3 parameters (BIC), 1 for the choice of a frequency
+_SHARE = 0.3  # a narrower line is preferred if it reaches this part of the largest gain in likelihood
 _HANN = 1.5  # under Hann's window neighbouring frequencies are correlated: three count as two
 _LOBE = 12  # frequencies on either side of a line into which the window spreads it
 _FULL = 40  # frequencies on either side of a line, and from 0 on, that are not averaged
 _PER_DECADE = 48  # groups of averaged frequencies
-_MIN_DRIFT = 1e-8  # variance of the drift's step per variance of noise: a constant is followed in 10^4 frames
+_MIN_DRIFT = 1e-8  # ratio of variances of the drift's step and the noise: a constant is followed in 10^4 frames
 _MIN_NOISE = 1e-3  # least ratio of noise to the level at high frequencies: drift may explain it, but filters need noise
 
 
@@ -46,11 +46,11 @@ class Model:
 
     Attributes:
         drift_nm2: variance of a random walk's step per frame, before the low-pass.
-        cutoff_hz: corner of a low-pass of the walk; infinite for none.
+        cutoff_hz: corner of the low-pass of the random walk; infinite without a low-pass.
         lines: vibration lines.
         noise_nm2: variance of one frame's white measurement noise.
         rate_hz: frame rate.
-        lowest_hz: below it the drift's spectrum is assumed flat: a log does not show slower changes.
+        lowest_hz: frequency below which the drift's spectrum is assumed flat: a log does not show slower changes.
     """
 
     drift_nm2: float
@@ -102,22 +102,21 @@ class Model:
         return np.asarray(block_diag(*blocks))
 
 
-def identify(run: TimeSeries, rate_hz: float) -> Model | None:
+def identify(series: TimeSeries, rate_hz: float) -> Model | None:
     """The model of a mode, from its pseudo-open-loop values (frames, 1) in pieces; None if there are too few.
 
-    The log of a closed loop is as good as an open loop's: its pseudo-open-loop modes are also disturbance plus white
-    noise.
+    The loop may be closed or open: in both cases the pseudo-open-loop modes are disturbance plus white noise.
     """
-    whittle = _Whittle.of(run, rate_hz)
+    whittle = _Whittle.of(series, rate_hz)
     if whittle is None:
         return None
     found = [whittle.fit(robust) for robust in (True, False)]  # a robust floor may be far off at the lowest frequencies
-    return replace(min(found, key=whittle.cost), lowest_hz=rate_hz / run.longest)
+    return replace(min(found, key=whittle.cost), lowest_hz=rate_hz / series.longest)
 
 
-def resolution_hz(run: TimeSeries, rate_hz: float) -> float:
+def resolution_hz(series: TimeSeries, rate_hz: float) -> float:
     """Frequency spacing of the periodogram that `identify` fits; 0 if there is none."""
-    return rate_hz / min(run.longest, _LONGEST) if run.longest >= FEWEST else 0.0
+    return rate_hz / min(series.longest, _LONGEST) if series.longest >= FEWEST else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,14 +129,14 @@ class _Whittle:
     rate_hz: float
 
     @classmethod
-    def of(cls, run: TimeSeries, rate_hz: float) -> "_Whittle | None":
-        frames = min(run.longest, _LONGEST)
+    def of(cls, series: TimeSeries, rate_hz: float) -> "_Whittle | None":
+        frames = min(series.longest, _LONGEST)
         if frames < FEWEST:
             return None
         window = np.hanning(frames + 2)[1:-1]
         window /= np.sqrt(np.sum(window**2))
         power, segments = np.zeros(frames // 2 + 1), 0
-        for piece in run.values:
+        for piece in series.values:
             for start in range(0, len(piece) - frames + 1, frames):
                 values = piece[start : start + frames, 0]
                 power += np.abs(rfft(window * (values - values.mean()))) ** 2
@@ -155,7 +154,7 @@ class _Whittle:
         return float((self.omega[1] - self.omega[0]) * self.rate_hz / (2 * np.pi))
 
     def fit(self, robust: bool) -> Model:
-        """Fit a floor, then lines one by one, then all; for a `robust` floor unknown lines matter little."""
+        """Fit the floor, then lines one by one, then all parameters; unknown lines hardly affect a `robust` floor."""
         model = self.fit_floor(Model(0.0, np.inf, (), 1.0, self.rate_hz), robust)
         while len(model.lines) < _MAX_LINES:
             line = self.another_line(model)
@@ -177,7 +176,7 @@ class _Whittle:
         return float((counts * (np.log(spectrum) + power / spectrum)).sum()) * self.segments / _HANN
 
     def grouped(self, lines: tuple[Line, ...], robust: bool) -> tuple[Array, Array, Array]:
-        """Frequency, power and count of groups: single frequencies near lines and 0, else even in the logarithm."""
+        """Means of frequency and power, and count, of groups: single frequencies near lines and 0, else logarithmic."""
         places = np.arange(self.omega.size)
         group = _FULL + np.floor(_PER_DECADE * np.log10(np.maximum(places, 1)))
         single = places < _FULL
@@ -198,7 +197,7 @@ class _Whittle:
         return omega, power, counts.astype(float)
 
     def fit_floor(self, model: Model, robust: bool) -> Model:
-        """Refit drift and noise with fixed lines."""
+        """Refit the floor, which is drift and noise, with fixed lines."""
         omega, power, counts = self.grouped(model.lines, robust)
         line_power = replace(model, drift_nm2=0.0).spectrum_nm2(omega)
         white = float(np.median(self.power[self.power.size // 2 :])) / (np.log(2) if self.segments == 1 else 1)
@@ -229,7 +228,7 @@ class _Whittle:
         return replace(model, drift_nm2=drift_nm2, cutoff_hz=cutoff_hz, noise_nm2=noise_nm2)
 
     def another_line(self, model: Model) -> Line | None:
-        """The most significant missing line; None if none is certain."""
+        """The most significant line that the model lacks; None if none is significant."""
         spectrum = model.spectrum_nm2(self.omega) + model.noise_nm2
         ratio = self.power / spectrum
         free = np.ones(ratio.size, bool)
@@ -247,7 +246,7 @@ class _Whittle:
             return None
         # Take the narrowest line with a fair share of the gain: a wide one could be two separate lines.
         place, scale = next((place, scale) for gain, place, scale in candidates if gain >= _SHARE * largest)
-        if scale == _SCALES[0]:  # take the one of the three frequencies that has the highest power
+        if scale == _SCALES[0]:  # of the three frequencies, take the one with the highest power
             place += int(np.argmax(self.power[place - 1 : place + 2])) - 1
         near = slice(max(place - max(_FULL, 3 * scale), 0), place + max(_FULL, 3 * scale) + 1)
         return self._fit_line(near, place, scale, spectrum[near])
@@ -269,7 +268,7 @@ class _Whittle:
         return line_of(minimize(cost, start, method="Nelder-Mead", options={"maxiter": 400, "xatol": 1e-3}).x)
 
     def needed(self, model: Model) -> tuple[Line, ...]:
-        """The lines that raise the likelihood significantly; one found early may stand for several found after it."""
+        """The lines that raise the likelihood significantly; an early line may have stood for several found later."""
         for line in sorted(model.lines, key=lambda line: line.variance_nm2):
             fewer = replace(model, lines=tuple(other for other in model.lines if other is not line))
             if self.cost(fewer) < self.cost(model):
@@ -282,7 +281,7 @@ class _Whittle:
         omega, power, counts = self.grouped(model.lines, robust=False)
         spacing, corner = self.spacing_hz, np.isfinite(model.cutoff_hz)
         highest_hz = self.rate_hz / 2 - spacing
-        # Kept, as derivatives change one parameter at a time.
+        # Cached, since numerical derivatives change one parameter at a time.
         drift_of = lru_cache(1)(partial(_drift, omega))
         line_of = lru_cache(2 * _MAX_LINES)(lambda line: _line(omega, *_per_frame(line, self.rate_hz)))
 

@@ -37,7 +37,7 @@ class VirtualIntegrators(NamedTuple):
         return cls(gain, kept, limit_nm, weights, (np.zeros_like(gain),) * lags)
 
     def advanced(self, pol_nm: Single) -> tuple["VirtualIntegrators", Single]:
-        """A copy one frame later, and the errors (rows, modes) that would have been measured, nm of wavefront rms."""
+        """A copy one frame later, and the errors (rows, modes), nm of wavefront rms, that its loops would measure."""
         error_nm = pol_nm
         for lag, weight in self.weights:
             error_nm = error_nm + (self.history_nm[lag] if weight == 1 else weight * self.history_nm[lag])

@@ -1,7 +1,7 @@
 """Simulation of another controller on the disturbance in a log.
 
-Pseudo-open-loop modes are the measurement less the commands seen in it; a sensor in its linear range would have
-measured them plus the commands of the other controller.
+Pseudo-open-loop modes are the measurement minus the commands seen in it. With the other controller, a sensor in its
+linear range would have measured these modes plus the commands of that controller.
 """
 
 from collections.abc import Callable
@@ -23,11 +23,11 @@ Controller = Callable[[Any, Single, Single], tuple[Any, Single]]
 MAX_DELAY_FRAMES = 5
 """Longest plausible delay of a working loop, frames."""
 _STILL_NM = 0.01  # rms difference of successive commands below which they hardly move
-_FEWEST = 20  # steps or commands from which a delay is determined
+_FEWEST = 20  # least number of steps or commands from which a delay is determined
 _NOT_NEW = sum(1 << reason for reason in NOT_NEW)
 
 
-def driven_by(law: LinearLaw, limit_nm: Single | None = None) -> Controller:
+def controller_of(law: LinearLaw, limit_nm: Single | None = None) -> Controller:
     """A linear law as a controller, at first at rest with a flat mirror; `limit_nm` (modes,) clips its commands."""
 
     def step(before: tuple[Single, Single] | None, error_nm: Single, pol_nm: Single) -> tuple[Any, Single]:
@@ -44,7 +44,7 @@ def driven_by(law: LinearLaw, limit_nm: Single | None = None) -> Controller:
 def limited_integrator(law: Integrator) -> Controller:
     """The live loop's integrator, with its limits, as a controller."""
     noll = tuple(range(2, 2 + law.gain.size))  # Noll indices, delay and rate are not used
-    return driven_by(integrator(law.gain, law.leak, noll, 1.0, 1.0), law.limit_nm)
+    return controller_of(integrator(law.gain, law.leak, noll, 1.0, 1.0), law.limit_nm)
 
 
 def has_new_exposure(reasons: Long) -> Mask:
@@ -157,12 +157,12 @@ def delay_from_times(
 
 
 def frames_since(begins: Mask, running: Mask, missing: Integers) -> Integers:
-    """Frames (steps,) since the loop started to run, or since a step of `begins`; -1 where it does not run."""
+    """Frames (steps,) since the loop started to run, or since the last step where `begins`; -1 while not running."""
     place = np.arange(len(running)) + np.cumsum(missing)
     started = running & (begins | ~np.concatenate([[False], running[:-1]]))
     return np.where(running, place - np.maximum.accumulate(np.where(started, place, 0)), -1)
 
 
 def rms(values: npt.NDArray[np.floating], rows: Mask) -> Array:
-    """Root mean square (modes,) of these rows of (steps, modes), about zero, in their unit."""
+    """Root mean square (modes,), about zero, of the values (steps, modes) in these rows (steps,), in their unit."""
     return np.asarray(np.sqrt(np.mean(values[rows].astype(np.float64) ** 2, axis=0)))

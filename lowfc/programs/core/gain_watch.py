@@ -8,7 +8,7 @@ import numpy.ma  # `np.median` would import it during the first verdict, which t
 
 from lowfc.arrays import Array, Mask, Single
 from lowfc.control.calibration.map_reconstructor import map_rows, noise_covariance_nm2
-from lowfc.control.laws.automatic_gain import CONFIDENCE, GainBank, Verdict, injected, uncorrected_prior_nm2
+from lowfc.control.laws.automatic_gain import CONFIDENCE, GainBank, Verdict, injected_fraction, uncorrected_prior_nm2
 from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.loop.inputs import COUNT_BITS, PendingEvent, Request, Step
 from lowfc.control.loop.safety import LoopMode
@@ -165,7 +165,9 @@ class GainWatch:
             if closed:
                 if verdict.loop_nm2 is None:
                     return None
-                now_nm2[mask] = np.maximum(open_nm2[mask] + verdict.loop_nm2, injected(group.gain) * verdict.noise_nm2)
+                now_nm2[mask] = np.maximum(
+                    open_nm2[mask] + verdict.loop_nm2, injected_fraction(group.gain) * verdict.noise_nm2
+                )
         per_nm2 = np.diag(self._contrast)
         return float(per_nm2 @ open_nm2), per_nm2 * now_nm2
 

@@ -21,7 +21,14 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.delay_fit import Delay
 from lowfc.control.laws import margins
 from lowfc.control.laws.stability import delay_weights, settling_frames
-from lowfc.control.laws.what_if import Controller, counterfactual, driven_by, limited_integrator, missing_before, rms
+from lowfc.control.laws.what_if import (
+    Controller,
+    controller_of,
+    counterfactual,
+    limited_integrator,
+    missing_before,
+    rms,
+)
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
@@ -275,7 +282,7 @@ class Commissioning:
         integrator, law = integrator_of(state), driving(state, self._loop.laws())
         if law is not None:
             settling = SETTLING_FRAMES + FADING_FRAMES + margins.settling_frames(law, state.delay_frames)
-            return driven_by(law, integrator.limit_nm), settling, []
+            return controller_of(law, integrator.limit_nm), settling, []
         automatic = np.array(state.automatic or [False] * len(noll), bool)
         integrator = replace(integrator, gain=np.where(automatic, np.float32(CHECK_GAIN), integrator.gain))
         settling = settling_frames(integrator.gain, integrator.leak, self._config.camera.rate_hz)
