@@ -40,7 +40,7 @@ from lowfc.control.loop.loading import (
     mode_events,
 )
 from lowfc.control.loop.requests import answer
-from lowfc.control.loop.reservation import counted_to_frame, lease_checked
+from lowfc.control.loop.reservation import lease_at_frame, lease_checked
 from lowfc.control.loop.safety import NOT_NEW, Limit, LoopMode, Reason, Rejection
 from lowfc.control.loop.state import ActiveLoop, Settings, State
 
@@ -73,7 +73,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     state, loop = _arrive(state, frame, events)
     lease_ended = False
     if state.conditions.lease is not None:
-        state = counted_to_frame(settings, state._replace(loop=loop), frame)
+        state = lease_at_frame(settings, state._replace(loop=loop), frame)
         state, lease_events = lease_checked(state, 0, frame.sequence)
         loop, lease_ended = state.loop, bool(lease_events)
         events += lease_events
@@ -100,7 +100,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     reported = (*reasons, Limit.LAW_OVERRULED) if _overruled(state, loop) else reasons
     mode, command_nm, commanded = state.mode, loop.history_nm[0], state.may_command
     steps_left, stepped = max(state.steps_left - 1, 0), state.steps_left == 1
-    state = State(  # constructed: `_replace` takes twice as long
+    state = State(  # constructed anew: `_replace` takes twice as long
         mode,
         loop,
         frame.sequence,
@@ -130,7 +130,7 @@ def _command_message(state: State, loop: ActiveLoop, command_nm: Single) -> Comm
     """The command of the newest frame."""
     safe = state.mode is LoopMode.SAFE
     sequence, conditions = state.frame_sequence, state.conditions
-    # Before the first frame the sequence is 0; the mirror may have had a newer one, which a new `clear_id` resets.
+    # Before the first frame the sequence is 0. The mirror may have applied a newer one, which a new `clear_id` resets.
     clear_id = conditions.clear_id or (0 if sequence else conditions.mode_since_ns)
     return Command(sequence, state.frame_time_ns, loop.actuators_nm, command_nm, safe, clear_id)
 
@@ -165,7 +165,7 @@ def _with_newest_frame(state: State, loop: ActiveLoop | None, frame: Frame) -> S
 def _measure(
     settings: Settings, state: State, loop: ActiveLoop, frame: Frame
 ) -> tuple[Estimate, int, Tables | None] | Rejection:
-    """Estimate of a frame, number of saturated pixels, tables if the fused step was used; or why it is refused."""
+    """Estimate, number of saturated pixels, tables if the fused step was used; or why the frame is refused."""
     calibration = loop.calibration
     if not calibration.noll:
         return Rejection.NO_CALIBRATION
@@ -194,7 +194,7 @@ def _measure(
 
 
 def _overruled(state: State, loop: ActiveLoop) -> bool:
-    """Whether the integrator determines part of a closed loop's command because the law did worse."""
+    """Whether the integrator determines part of a closed loop's command because the law had a larger error."""
     guard = loop.law_runner.guard if loop.law_runner is not None else None
     return guard is not None and state.mode is LoopMode.CLOSED and guard.overruled
 
@@ -245,7 +245,7 @@ def _refuse(
 
 
 def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]:
-    """Without frames, repeat the held command, so that it expires only if the controller dies; or relax to flat."""
+    """Without frames, repeat the held command, so that it expires only if the controller dies; or step to flat."""
     state, events = lease_checked(state, tick.time_ns, 0)
     lease_ended = bool(events)
     loop = state.loop

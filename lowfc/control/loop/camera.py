@@ -41,7 +41,7 @@ class CameraSettings:
 
 
 def changes(now: CameraSettings, then: CameraSettings) -> list[str]:
-    """Phrases for the changes that make a calibration invalid, from its settings `then` to the settings `now`."""
+    """Phrases for the changes that make a calibration invalid: `then` are its settings, `now` those of the camera."""
     tolerance_dn = max(MIN_TOLERANCE_DN, then.noise_dn)
     exact = (
         ("rows", now.shape[0], then.shape[0]),
@@ -51,8 +51,8 @@ def changes(now: CameraSettings, then: CameraSettings) -> list[str]:
     )
     levels = (("bias_dn", now.bias_dn, then.bias_dn), ("saturation_dn", now.saturation_dn, then.saturation_dn))
     gains = (("gain_e_per_dn", now.gain_e_per_dn, then.gain_e_per_dn), ("em_gain", now.em_gain, then.em_gain))
-    different: list[tuple[str, float, float]] = [(name, got, want) for name, got, want in exact if got != want]
-    different += [(name, got, want) for name, got, want in levels if not abs(got - want) <= tolerance_dn]
-    known_gains = ((name, got, want) for name, got, want in gains if min(got, want) > 0)
-    different += [(name, got, want) for name, got, want in known_gains if abs(got / want - 1) > GAIN_TOLERANCE]
-    return [f"{name} is {got:g}, calibrated {want:g}" for name, got, want in different]
+    different: list[tuple[str, float, float]] = [(name, new, old) for name, new, old in exact if new != old]
+    different += [(name, new, old) for name, new, old in levels if not abs(new - old) <= tolerance_dn]
+    known_gains = ((name, new, old) for name, new, old in gains if min(new, old) > 0)
+    different += [(name, new, old) for name, new, old in known_gains if abs(new / old - 1) > GAIN_TOLERANCE]
+    return [f"{name} is {new:g}, calibrated {old:g}" for name, new, old in different]

@@ -1,4 +1,4 @@
-"""Additions to the loop's command: static channels, an offset of its target, a table played frame by frame.
+"""Additions to the loop's command: static channels, an offset of the loop's target, a table played frame by frame.
 
 A channel is a mirror shape from a source other than the control law, such as one that digs a dark hole. The sensor sees
 it, so the sensor's zero point shifts with it (Subedi et al. 2015, Sect. 1 and 4), after the delay of a command, and the
@@ -22,16 +22,16 @@ EXTERNAL = "external"
 """Channel of shapes that other programs apply to the mirror: the loop does not command it."""
 MAX_CHANNELS = 16
 MAX_PROBE_NUMBERS = 1 << 24
-"""Most numbers in the table of a probe sequence, and in its basis."""
+"""Most numbers in the table of a probe sequence, and most numbers in its basis."""
 MIRROR, OFFSET = "mirror", "offset"
 """Targets of a probe sequence."""
-MAX_NAME_LENGTH = 32
+MAX_NAME_LENGTH = 32  # characters
 
 
 class Channel(NamedTuple):
     """A shape added to the command, (rows, columns), nm of surface, and the part of it reached so far.
 
-    Once the command has reached the shape, `reached_nm` is the same array as `shape_nm`; `of` makes it so.
+    Once the command has reached the shape, `reached_nm` is the same array as `shape_nm`; `of` ensures this.
     """
 
     name: str
@@ -55,7 +55,7 @@ class Channel(NamedTuple):
 
     @property
     def moving(self) -> bool:
-        """Whether the mirror is still moving to it."""
+        """Whether the command has not reached the shape yet."""
         return self.reached_nm is not self.shape_nm
 
 
@@ -178,7 +178,7 @@ class CommandChannels(NamedTuple):
         return self.with_channel(Channel.of(name, shape_nm, reached_nm), to_modes)
 
     def at_once(self, before: "CommandChannels") -> "CommandChannels":
-        """A copy in which the change of `shift_nm` since `before` also applies to the last frames."""
+        """A copy in which the change of `shift_nm` from `before` to now also applies to the last frames."""
         change_nm = self.shift_nm - before.shift_nm
         return self._replace(shifts_nm=tuple(shift_nm + change_nm for shift_nm in self.shifts_nm))
 
@@ -199,7 +199,7 @@ class CommandChannels(NamedTuple):
         return self._replace(play=self.play._replace(frames=remaining))
 
     def passed(self, frames: int = 1) -> "CommandChannels":
-        """A copy advanced by some frames."""
+        """A copy advanced by some frames, in which the sensor sees the present shift of the zero point."""
         newest = (self.shift_nm,) * min(frames, len(self.shifts_nm))
         return self._replace(shifts_nm=(*newest, *self.shifts_nm)[: len(self.shifts_nm)])
 

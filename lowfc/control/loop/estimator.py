@@ -10,7 +10,7 @@ from lowfc.control.kernel.tables import NUMPY, Estimate, Kernel, Tables
 
 
 class Estimator(NamedTuple):
-    """R times the `difference` of a frame, in the fastest order: R (I - dark) and the flux in one product.
+    """R times the `difference` of a frame, in the fastest order of operations: one product gives R (I - dark) and flux.
 
     Rounding adds about 1e-5 nm to a mode of the paper's sensor.
 
@@ -42,9 +42,9 @@ class Estimator(NamedTuple):
 
     def estimate(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
         """Estimate of a frame (pixels,) by the reference step; None if its flux is at most `min_flux_dn`."""
-        np.copyto(self.scratch, pixels)  # separately: faster than a subtraction of two types
+        np.copyto(self.scratch, pixels)  # a copy and a subtraction are faster than a subtraction of two types
         np.subtract(self.scratch, self.dark, out=self.scratch)
-        sums = self.rows.dot(self.scratch)  # half a microsecond less than `@`
+        sums = self.rows.dot(self.scratch)  # takes half a microsecond less than `@`
         flux_dn = float(sums[-1])
         if not flux_dn > min_flux_dn:
             return None

@@ -84,7 +84,7 @@ def per_mode(noll: tuple[int, ...], request: Request, before: Single) -> Single:
     """Values of all modes (modes,), in their unit, updated with those of the request.
 
     Raises:
-        ValueError: what is wrong with the request.
+        ValueError: the request is wrong; the text says in what.
     """
     modes = _modes(noll, request)
     if len(request.values) not in (1, len(modes)):
@@ -131,7 +131,7 @@ def check_gains(gains: Iterable[float], leaks: Iterable[float], delay_frames: fl
 
 
 def prepare_gains(settings: Settings, request: Request) -> None:
-    """Cache what a reply to a request for gains or leaks needs, so that no frame waits for it."""
+    """Cache the highest gains that the reply to a request for gains or leaks needs, so that no frame waits for them."""
     leaks = np.unique(np.array(request.values if request.name == "leak" else settings.leak, np.float32))
     if leaks.size <= _MAX_PREPARED:
         for leak in leaks[(leaks >= 0) & (leaks <= 1)].tolist():

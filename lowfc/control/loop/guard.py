@@ -62,11 +62,11 @@ class Group(NamedTuple):
     """The guard's state for a group of modes.
 
     Attributes:
-        overruled: whether the integrator drives it.
+        overruled: whether the integrator drives the group.
         faded: frames of the cross-fade to the integrator so far.
         takeovers: number of takeovers by the integrator; `MAX_TAKEOVERS` after one from an amplifying loop.
         blocks: blocks in a row in favour of a change.
-        usual_nm2: long-term sum of the mean squares of its pseudo-open-loop modes.
+        usual_nm2: long-term sum of the mean squares of the group's pseudo-open-loop modes.
     """
 
     overruled: bool = False
@@ -77,11 +77,11 @@ class Group(NamedTuple):
 
     @property
     def final(self) -> bool:
-        """Whether only an operator can let the law drive it again."""
+        """Whether only an operator can let the law drive the group again."""
         return self.takeovers >= MAX_TAKEOVERS
 
     def judged(self, means_nm2: Sequence[float], spans: Spans, *, void: bool) -> tuple["Group", str]:
-        """The group after a block, and why the law is overruled, or `LAW_RETURNS`; empty if nothing changes.
+        """The group after a block, and why the law is overruled, or `LAW_RETURNS`, or nothing if nothing changes.
 
         Args:
             means_nm2: means over the block of the squares of errors, virtual errors and pseudo-open-loop modes.
@@ -122,7 +122,7 @@ class LawGuard(NamedTuple):
         void: whether the virtual loop was interrupted during the block.
         virtual_nm: virtual commands (modes,), newest first: for each mode, of the controller that does not drive it;
             empty until the virtual loop starts from the loop's commands.
-        x: state (states,) of the law as if it drove the overruled modes too; None while no mode is overruled.
+        x: state (states,) of a virtual law that drives the overruled modes too; None while no mode is overruled.
     """
 
     spans: Spans
@@ -206,11 +206,11 @@ class LawGuard(NamedTuple):
         Args:
             law: the guarded law.
             x: (states,) its state after this frame, in the real loop.
-            integrator: the integrator that it is compared with.
+            integrator: the integrator with which the law is compared.
             weights: lag and weight of each command that an exposure sees.
             history_nm: the loop's commands (modes,) before this frame's, newest first.
             error_nm: (modes,) error of this frame, relative to the loop's target.
-            pol_nm: (modes,) pseudo-open-loop modes, also relative to it.
+            pol_nm: (modes,) pseudo-open-loop modes of this frame, also relative to the target.
             limited: whether a limit of the mirror acted on the last command; virtual commands ignore these limits.
         """
         spans, groups = self.spans, self.groups

@@ -42,8 +42,8 @@ class Request:
 
     Attributes:
         modes: Noll indices that the values are for; empty for all.
-        values: one for all modes, or one for each; frames of a step, or duration of a lease or permit, s.
-        text: name of a channel, target of a probe sequence, holder of a lease, a note; or `AUTO`, for automatic gains.
+        values: one for all modes, or one for each; number of frames of a step; or duration of a lease or permit, s.
+        text: name of a channel, target of a probe sequence, holder of a lease, or a note; `AUTO` for automatic gains.
         actuators_nm: one or more shapes of the mirror, one after the other, nm of surface.
         table: (frames, columns) of a probe sequence.
         law: the law to drive the mirror; None for the integrator.
@@ -77,7 +77,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class MirrorShape:
-    """The mirror's shape: actuators (rows, columns) nm of surface, and their modal command.
+    """The mirror's shape: actuators (rows, columns), nm of surface, and the modal command (modes,) of this shape, nm.
 
     Attributes:
         safe: whether the mirror's last command was sent in safe mode.
@@ -114,7 +114,7 @@ class Load:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """No frame arrived; `silent_ns` is the time since the last, computed before the call of `advance`."""
+    """No frame arrived; `silent_ns` is the time since the last frame, computed before the call of `advance`."""
 
     time_ns: int
     silent_ns: int
@@ -146,7 +146,7 @@ class Step(NamedTuple):
 
     @property
     def frame(self) -> int:
-        """Number of its frame since its camera started, as in `lowfc ctl` and the views."""
+        """Number of the frame since its camera started, as in `lowfc ctl` and the views."""
         return self.frame_sequence & 0xFFFF_FFFF
 
 
@@ -154,8 +154,9 @@ class Command(NamedTuple):
     """A command to the mirror: (rows, columns) float32, nm of surface.
 
     Attributes:
-        safe: the loop is in safe mode.
-        clear_id: identity of the operator's last clear or, before the first frame, of the mode's beginning; else 0.
+        safe: whether the loop is in safe mode.
+        clear_id: identity of the operator's last clear; if none, 0 or, before the first frame, the time of the mode's
+            beginning.
     """
 
     frame_sequence: int
@@ -182,7 +183,7 @@ class Reply(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Outputs of one input; `changed`: whether the state changed by more than a frame's ordinary update."""
+    """Outputs of one input; `changed` is whether the state changed by more than the ordinary update for a frame."""
 
     step: Step | None = None
     command: Command | None = None

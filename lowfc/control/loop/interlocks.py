@@ -52,7 +52,7 @@ class Interlock(NamedTuple):
     acts_when_old: bool = True
 
     def cause(self, value: Value | None, age_ns: int) -> str:
-        """Why it acts on a value of this age (None if never received); empty if it does not act."""
+        """Why the interlock acts on a value of this age (None if never received); empty if it does not act."""
         max_age_s = self.max_age_ns * 1e-9
         if value is None:
             return f"no value of {self.name} has been received" if self.acts_when_old else ""
@@ -87,7 +87,7 @@ class Acting(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BenchReport:
-    """The newest bench value of this name; None if none was received. The process computes its age before `advance`."""
+    """The newest bench value of this name, None if none was received; the process computes its age before `advance`."""
 
     time_ns: int
     name: str
@@ -127,7 +127,7 @@ def shown(value: Value) -> str:
 
 
 def _by_value(why: str, report: BenchReport) -> bool:
-    """Whether an interlock acts because of a value, not because one is missing."""
+    """Whether an interlock with this cause acts because of the value, not because a value is missing."""
     return why.startswith(f"{report.name} is ")
 
 

@@ -34,9 +34,9 @@ class Lease(NamedTuple):
     Attributes:
         id: identity in the holder's requests; above 0.
         holder: the holder and its purpose, for people.
-        until_ns: end by the controller's clock, unless it is renewed.
-        last_sequence: sequence of the last frame for which it is in force, if frames come at the configured rate; its
-            duration in frames if it was granted before the first frame; 0 if the rate is unknown.
+        until_ns: time at which it ends by the controller's clock, unless it is renewed.
+        last_sequence: sequence of the last frame for which it is in force, if frames come at the configured rate; 0 if
+            the rate is unknown. Before the first frame, the duration of the lease in frames.
         ended: cause of its end; empty while it is in force.
         holds: whether it is a permit: a closed loop holds its command while the permit is in force.
     """
@@ -69,7 +69,7 @@ class Lease(NamedTuple):
         return f"the loop is reserved for {self.holder} (while that runs, and for at most {remaining_s} s after it)"
 
     def refused_message(self, time_ns: int) -> str:
-        """Message that the loop is reserved, and how to end that in every mode."""
+        """Message that the loop is reserved, and how to end the reservation in every mode."""
         return f"{self.reserved_message(time_ns)}; `lowfc ctl stop` ends that, `open`, `pause` and `safe` too"
 
 
@@ -94,7 +94,7 @@ def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:
 
 
 def asked_by(held: Lease | None, request: Request) -> str:
-    """Cause of a change of the loop: the request and the purpose of its lease, or the text sent by automatic gains."""
+    """Cause of a change of the loop: the request and the purpose of its lease, or the text from automatic gains."""
     if request.text.startswith(f"{AUTO}: "):
         return request.text
     if held is not None and request.lease_id and request.lease_id == held.id:

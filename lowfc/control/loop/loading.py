@@ -17,7 +17,7 @@ from lowfc.control.loop.wording import CAMERA_MISFIT, MEASURED_FIRST
 ADOPTED_NM = 1.0
 """Deviation of an actuator from the modal command above which a mirror's shape is adopted as a channel, nm."""
 REFUSED_IN_A_ROW = 3
-"""Number of frames refused in a row from which on a closed loop counts as holding its command."""
+"""A closed loop counts as holding its command once this number of frames in a row is refused."""
 LATCHED = "it was in safe mode before the controller started"
 MIRROR_WAS_SAFE = "the mirror's last command was sent in safe mode"
 
@@ -198,7 +198,7 @@ def mirror_shape_reported(settings: Settings, state: State, shape: MirrorShape) 
     if command_nm.any():
         events.append(PendingEvent("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
     if state.mode is not LoopMode.SAFE:  # in safe mode the mirror relaxes to flat and stays there
-        channels = loop.command_channels  # clients may have set some before a late report
+        channels = loop.command_channels  # clients may have set channels before a late report
         loop, adoption_events = adopted(
             loop, shape.actuators_nm if channels is None else shape.actuators_nm - channels.sum_nm
         )
@@ -207,9 +207,9 @@ def mirror_shape_reported(settings: Settings, state: State, shape: MirrorShape) 
 
 
 def mirror_fault_reported(settings: Settings, state: State, report: MirrorReport) -> tuple[State, Outputs]:
-    """Hold while the mirror does not follow; a closed loop steps back to the mirror's last shape, against wind-up.
+    """Hold the command while the mirror does not follow; a closed loop returns to its last shape, against wind-up.
 
-    A large step back takes several reports, within the slew limit.
+    A return of more than the slew limit takes several reports.
     """
     fault, loop = report.fault, state.loop
     changed = fault != state.conditions.mirror_fault
@@ -281,7 +281,7 @@ def _with_camera(state: State, camera: CameraSettings) -> State:
 
 
 def adopted(loop: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[PendingEvent]]:
-    """Make a shape's deviation (rows, columns) from the modal command a channel, unless it is the driver's rounding."""
+    """Make a shape's deviation (rows, columns) from the modal command a channel, unless it is only rounding."""
     deviation_nm = shape_nm.copy()
     deviation_nm -= (loop.to_actuators @ loop.history_nm[0]).reshape(deviation_nm.shape)
     if not np.abs(deviation_nm).max() > ADOPTED_NM:

@@ -60,7 +60,7 @@ def _handler(request: Request, lease_before: Lease | None) -> "Handler":
 
 
 def prepared(settings: Settings, request: Request) -> Request:
-    """Do the slow checks of a request that need no state; the process calls this where no frame has to wait.
+    """Do the slow checks of a request that need no state; the process calls this where no frame waits for it.
 
     A fault becomes its `refusal`. A prepared request is returned unchanged.
     """
@@ -101,7 +101,7 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
         reply = "the loop stays closed"
     if request.name == "close" and request.text.startswith(f"{AUTO}: ") and not state.waits_for_gains:
         raise ValueError("the loop no longer waits for its gains")
-    # In these cases the mode is open already, so `in_mode` would keep the former cause.
+    # In both cases the mode is open already, so `in_mode` would keep the former cause.
     if (request.name == "open" and paused) or (after is LoopMode.OPEN and state.waits_for_gains):
         state = state._replace(conditions=state.conditions._replace(mode_cause=cause))
     if after is LoopMode.CLOSED and state.loop is not None and state.loop.calibration.provisional:
@@ -281,7 +281,7 @@ def _load(settings: Settings, state: State, request: Request) -> Handled:
     if not safe_pending(settings, state):  # an idle loop opens, whatever the configured mode
         settings = replace(settings, start_mode=LoopMode.OPEN)
     after, events = loaded(settings, state, request.calibration, "operator", request.time_ns)
-    loop = _active_loop(after)  # an offset beyond its limit, which may have been lowered, is no reason to refuse
+    loop = _active_loop(after)  # an offset may exceed a limit that was lowered later: this is no reason to refuse
     check_offset(loop, np.minimum(np.abs(loop.channels_or_empty().offset_nm), loop.integrator.limit_nm))
     return after, f"calibration {request.calibration.id[:12]}", *events
 

@@ -36,7 +36,7 @@ def renew(settings: Settings, state: State, request: Request) -> tuple[State, st
 
 
 def release(settings: Settings, state: State, request: Request) -> tuple[State, str] | tuple[State, str, PendingEvent]:
-    """End a lease at its holder's request; another client's stays."""
+    """End a lease at its holder's request; a lease of another client stays in force."""
     held = state.conditions.lease
     if held is None or held.ended or held.id != request.lease_id:
         return state, "this lease is not in force"
@@ -44,12 +44,12 @@ def release(settings: Settings, state: State, request: Request) -> tuple[State, 
     return after, "released", PendingEvent("LEASE_RELEASED", {"holder": held.holder_name})
 
 
-def counted_to_frame(settings: Settings, state: State, frame: Frame) -> State:
+def lease_at_frame(settings: Settings, state: State, frame: Frame) -> State:
     """The state at a new frame, with its lease shortened by the frame periods that passed since the last frame.
 
-    Their number follows from the times of the two frames, which may be from another clock than the lease's. If the
-    times do not increase, or after a silence (in which each tick compared the controller's clock with the lease), each
-    frame counts as one period. At a start of the camera the lease keeps its remaining periods.
+    Their number follows from the times of the two frames, whose clock may differ from the lease's. Each frame counts as
+    one period if the times do not increase, and after a silence, in which each tick compared the controller's clock
+    with the lease. At a start of the camera the lease keeps its remaining periods.
     """
     held, frames = state.conditions.lease, frame.sequence - state.frame_sequence
     if held is None or held.ended or not (settings.rate_hz and held.same_start(state.frame_sequence)):
@@ -65,7 +65,7 @@ def counted_to_frame(settings: Settings, state: State, frame: Frame) -> State:
 
 
 def lease_checked(state: State, time_ns: int, frame_sequence: int) -> tuple[State, list[PendingEvent]]:
-    """End a lease that was not renewed by this time or frame (0: not compared); the state and the event."""
+    """End a lease that has expired at this time or frame (0: not compared); return the state and the event."""
     held = state.conditions.lease
     if held is None or held.ended or not held.expired(time_ns, frame_sequence):
         return state, []
@@ -73,7 +73,7 @@ def lease_checked(state: State, time_ns: int, frame_sequence: int) -> tuple[Stat
 
 
 def lease_ended(state: State, why: str) -> tuple[State, list[PendingEvent]]:
-    """End the lease in force and its probe sequence; the state and the event."""
+    """End the lease in force and the probe sequence; return the state and the event."""
     held = state.conditions.lease
     if held is None or held.ended:
         return state, []
@@ -108,7 +108,7 @@ def permit(settings: Settings, state: State, request: Request) -> tuple[State, s
 
 
 def _extended(settings: Settings, state: State, request: Request) -> Lease:
-    """A lease from now on; ValueError if the request is wrong."""
+    """The lease that a request asks for, from its time on; ValueError if the request is wrong."""
     holder, values = request.text.strip(), request.values
     duration_s = values[0] if len(values) == 1 else 0.0
     if not 0 < duration_s <= MAX_S:

@@ -55,7 +55,7 @@ class Rejection(IntEnum):
 
 
 NOT_NEW = frozenset((Rejection.OUT_OF_ORDER, Rejection.REPEATED, Rejection.AHEAD))
-"""Reasons for refusing a frame that is no new exposure, or whose time is not that of its exposure."""
+"""Rejections of a frame that is no new exposure, or whose time is not the time of its exposure."""
 
 
 class Limit(IntEnum):
@@ -165,9 +165,9 @@ def limit(limits: Limits, previous_nm: Single, requested_nm: Single) -> Limited:
 
 
 def _shorten(limits: Limits, previous_nm: Single, kept_nm: Single) -> Single:
-    """Go from `previous_nm` towards `kept_nm` as far as neighbours allow; if already beyond, shrink the shape.
+    """Go from `previous_nm` towards `kept_nm` as far as neighbours allow; shrink `previous_nm` if it exceeds a limit.
 
-    It stops half a margin further inside than `limit` requires, so that rounding does not block the mirror there.
+    The result is half a margin further inside than `limit` requires, so that rounding does not block the mirror there.
     """
     margin_nm = limits.margin_nm
     neighbour_nm = limits.neighbour_nm - margin_nm
@@ -207,7 +207,7 @@ def neighbour_difference_nm(actuators_nm: npt.NDArray[np.floating]) -> float:
 
 
 def expired(age_ns: int, valid_for_ns: int) -> bool:
-    """Whether a command received `age_ns` ago may no longer be held (command timeout, or the clock went back)."""
+    """Whether a command received `age_ns` ago may no longer be held: it timed out, or the clock went back."""
     return not 0 <= age_ns <= valid_for_ns
 
 

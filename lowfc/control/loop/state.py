@@ -29,7 +29,7 @@ SETTLING_FRAMES = 100
 FADING_FRAMES = 100
 """Frames of the cross-fade in which a law takes over."""
 MAX_PREDICTED_FRAMES = 100
-"""Most frames missing at once that a law predicts; after more, it observes and fades in again."""
+"""Most consecutive missing frames that a law predicts; after more, it observes and fades in again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Settings:
         on_frame_timeout: hold the command, or relax the mirror to flat.
         min_flux_fraction: fraction of the expected flux below which a frame is refused.
         max_saturated_pixels: number of good pixels at full well above which a frame is refused.
-        max_identical_frames: consecutive frames that may give the same measurement as the one before; 0 for no limit.
+        max_identical_frames: most consecutive frames with the same measurement as the frame before; 0 for no limit.
         gain: gain of tip and tilt, and gain of the other modes; `leak` and `limit_nm` (nm) have the same order.
         rate_hz: frame rate; 0 if unknown.
         guard: whether laws are guarded.
@@ -84,7 +84,7 @@ class Settings:
 
 
 class LawRunner(NamedTuple):
-    """A running linear law: its state x (states,), and the number of frames processed since it began to observe.
+    """A running linear law: its state x (states,), and the number of `frames` processed since it began to observe.
 
     It observes for `SETTLING_FRAMES`; over the next `FADING_FRAMES` it takes over from the integrator in a cross-fade,
     so that the mirror does not jump. When the loop closes, `frames` is set back to at most `SETTLING_FRAMES`. Once
@@ -152,14 +152,14 @@ class ActiveLoop(NamedTuple):
     """The loop once the mirror's grid is known, from a calibration or from the mirror's report.
 
     Attributes:
-        calibration: the one in use; without modes or pixels if none was loaded.
-        estimator: from frames to modal errors.
+        calibration: the calibration in use; without modes or pixels if none was loaded.
+        estimator: computes the modal errors of a frame.
         integrator: gain, leak and limit of each mode; a law has these limits too.
         to_actuators: (actuators, modes) as in the calibration, in the memory layout in which its product is faster.
         inverse: (modes, actuators) modal command of a mirror shape.
         to_modes: (modes, actuators) modes that R measures of a mirror shape, nm of wavefront rms per nm of surface.
         delay_weights: (index in `history_nm`, fraction) of each command that an exposure sees.
-        camera: camera settings in the calibration, or else the first received that fit it; None until then.
+        camera: camera settings in the calibration, else the first received settings that fit it; None until then.
         automatic: (modes,) whether the gain of a mode is automatic.
         weighting: weighting of R; None for the calibration's own R.
         law_runner: linear law in use instead of the integrator; None for the integrator.
@@ -244,7 +244,7 @@ class ActiveLoop(NamedTuple):
 
     def with_command(self, command_nm: Single, actuators_nm: Single) -> "ActiveLoop":
         """A copy advanced by one frame, with this command."""
-        fixed = self[:-3]  # `_replace` would take twice as long
+        fixed = self[:-3]  # the fields but the last three; `_replace` would take twice as long
         command_channels = None if self.command_channels is None else self.command_channels.passed()
         return ActiveLoop(*fixed, command_channels, (command_nm, *self.history_nm[:-1]), actuators_nm)
 
@@ -277,7 +277,8 @@ class Conditions(NamedTuple):
         camera: settings of the camera as last received; None before the first.
         camera_awaited: whether the camera restarted and its settings have not been received since.
         clear_id: identity of the operator's last clear; 0 without one.
-        mode_since_ns: time of the change to this loop mode, and `mode_cause` its cause.
+        mode_since_ns: time of the change to this loop mode.
+        mode_cause: cause of this change.
         lease: the reservation of the loop, or the last one that ended; None before the first.
         mirror_fault: why the mirror does not follow commands; empty if it does.
         acting: the acting interlocks.
@@ -298,14 +299,16 @@ class State(NamedTuple):
 
     Attributes:
         frame_sequence: sequence of the newest frame, 0 before the first and after `clear`; its time is `frame_time_ns`.
-        refused: why the last frame was refused, None if it was used; `refused_count` frames in a row were refused.
+        refused: why the last frame was refused; None if it was used.
+        refused_count: number of frames refused in a row, up to the last frame.
         limits_hit: limits that acted on the last command.
         frame_timeout: whether no frame has come for longer than the frame timeout.
         commanded: whether a command has been sent, so that the mirror's shape is no longer adopted.
         counts: number of frames, or of frame timeouts, for each reason.
         steps_left: used frames until the loop opens automatically; 0 for never.
         returning_to_zero: whether the modal command is returning to zero.
-        estimate: the last measurement; directly before it, `identical_frames` measurements in a row were equal to it.
+        estimate: the last measurement.
+        identical_frames: number of measurements in a row directly before it that were equal to it.
         input_number: count of the inputs that changed the state or produced output; the order of replay.
     """
 
