@@ -8,9 +8,9 @@ from lowfc.design.trials import noisy_e
 from lowfc.optics.chain.zernike import NOLLS_14, zernikes
 from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, reference, response
 
-_INSTANTS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)  # instants imaged (Gauss-Legendre), in exposure times
-_SAMPLE_TIMES = (np.arange(8) + 0.5) / 8  # times at which the residual is sampled, in periods
-_SETTLING_TIME_CONSTANTS = 8.0  # settling, in time constants of the slowest mode
+_INSTANTS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)  # instants of an exposure (Gauss-Legendre), in exposure times
+_SAMPLE_TIMES = (np.arange(8) + 0.5) / 8  # times at which the residual is sampled, in frame periods
+_SETTLING_TIME_CONSTANTS = 8.0  # time in which the loop settles, in time constants of its slowest mode
 
 
 def simulated_residual_nm2(
@@ -32,7 +32,7 @@ def simulated_residual_nm2(
         exposure: Exposure time, in frame periods.
         step_nm2: (14,) variance of each mode's step in a frame, nm^2.
         gain: (14,) gains of the integrators; 0 for a mode that is not controlled; at least one is above 0.
-        frames: Number of frames averaged, after those in which the loop settles.
+        frames: Number of frames over which the residual is averaged, after those in which the loop settles.
         rng: Generator of all random numbers.
     """
     basis = zernikes(NOLLS_14, *node_radii(twin))

@@ -9,10 +9,10 @@ from lowfc.arrays import Array
 from lowfc.control.calibration.calibration import ESTIMATORS, reconstructor
 
 Model = Callable[[Array], Array]
-"""Function from modes in nm to the image (pixels,), fractions of the open circle's light, from the full exp(i phi)."""
+"""Function from modes, nm, to the image (pixels,), fractions of the open circle's light, with the full exp(i phi)."""
 
 KINDS = ESTIMATORS[::-1]
-"""Kinds of linear estimator; the paper's plain pseudo-inverse first."""
+"""Kinds of linear estimator; the first is the paper's plain pseudo-inverse."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ def fit(I0: Array, H: Array, scale_e: float, read_noise_e: float, kind: str, nui
         H: (pixels, modes) derivative of the image per nm of each mode.
         scale_e: Electrons of the open circle's light in the exposure: the factor from fractions to electrons.
         read_noise_e: Read noise of each pixel.
-        kind: "pinv" weights all pixels equally, "weighted" by the inverse variance of the flat image.
+        kind: "pinv" weights all pixels equally, "weighted" by the inverse variance of the flat wavefront's image.
         nuisance: (pixels, extra) changes of the image by nuisance parameters, in fractions per unit of each: I0 for the
             flux, `lowfc.optics.chain.sensor.shear_response` for the pupil's shear. They are fitted and dropped.
 
@@ -59,7 +59,7 @@ def estimate(fit: Fit, image_e: Array) -> Array:
 def iterated(fit: Fit, image_e: Array, model: Model, iterations: int) -> list[Array]:
     """Estimates (modes,) in nm after 0, 1, ... `iterations` with the full model: a <- a + R (I - I_model(a)).
 
-    R is constant, the model is nonlinear; two iterations suffice for wavefronts with the input rms of Table 3.
+    R is constant, the model is nonlinear. Two iterations suffice for wavefronts with the input rms of Table 3.
 
     Args:
         fit: The linear estimator.

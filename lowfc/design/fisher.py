@@ -35,7 +35,7 @@ def covariance(R: Array, variance: Array) -> Array:
 def cramer_rao(H: Array, variance: Array) -> Array:
     """Inverse Fisher information (modes, modes), nm^2: no unbiased linear estimate has a smaller covariance.
 
-    It includes the information in the image's mean, not the small amount in the variance of the photon noise.
+    It includes the information in the mean image, but not the little information in the variance of the photon noise.
 
     Args:
         H: (pixels, modes) electrons per nm.

@@ -1,7 +1,7 @@
-"""Predicted performance of sensors that use all light from the focal-plane mask (Zernike, CLOWFS), for a search.
+"""Performance, predicted for a search, of sensors that use all light from the focal-plane mask (Zernike, CLOWFS).
 
 The fields on the focal-plane mask depend on neither the phase spot nor the defocus: they are computed once, and
-propagated from there to the detector for each candidate.
+propagated from the mask to the detector for each candidate.
 """
 
 from collections.abc import Callable
@@ -32,9 +32,9 @@ class FocalLight:
 
     Attributes:
         forms: Quadratic forms of the pupil.
-        fields: By wavelength in nm, (1 + modes, k, k) fields of the pupil, and of the pupil times each of the 20 modes.
+        fields: By wavelength, nm: (1 + modes, k, k) fields on the mask, of the pupil and of the pupil times each mode.
         wavefronts_nm: By the number of modes, (wavefronts, modes) random wavefronts matched to Table 3's input.
-        aberrated: By the number of modes, (wavefronts, k, k) fields of these wavefronts at the central wavelength.
+        aberrated: By the number of modes, (wavefronts, k, k) fields of these on the mask, at the central wavelength.
     """
 
     forms: PupilForms

@@ -15,12 +15,12 @@ def maximise(rows: Array, weights: Array, multipliers: Array) -> tuple[Array, Ar
 
     scipy accepts no starting basis. Therefore each row with a multiplier gets its own slack variable and is added to
     the objective with its multiplier. The simplex then starts at the optimum that belongs to the multipliers, and needs
-    a sixth to three quarters of the steps of a cold start. Presolving would undo this.
+    a sixth to three quarters of the steps of a cold start. Presolving would change this starting point.
 
     Args:
         rows: (m, n) constraints.
         weights: (n,) objective.
-        multipliers: (m,) multipliers of a similar program, zero if not known.
+        multipliers: (m,) multipliers of a similar program; zero for a row without one.
 
     Returns:
         x (n,), the multipliers (m,), and the dual bound on the objective, which proves the optimum.

@@ -24,7 +24,7 @@ WAVELENGTH_NM = 550.0  # central wavelength, Table 1 of the paper
 BAND = uniform(WAVELENGTH_NM)
 """Passband of Table 4."""
 CONTROLLED = len(NOLLS_14)
-"""Number of controlled modes, for the noise, the added contrast and the share of the quantum limit."""
+"""Number of controlled modes: their noise, added contrast and ratio to the quantum limit are predicted."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Signal:
         I0: (samples,) image of a flat wavefront, fraction of the open circle's light per pixel.
         H: (samples, modes) derivative of the image per nm rms of each mode.
         pixels_per_sample: Number of pixels that each sample represents.
-        peak: Largest value of a pixel of I0; in a band, of a sample.
+        peak: Largest value of a pixel of I0; in a band, largest value of a sample.
     """
 
     I0: Array
@@ -138,7 +138,7 @@ def table4_mas(signal: Signal, modes: int, estimator: str) -> tuple[float, float
 
 
 def exposure_nm2(signal: Signal, modes: int, estimator: str) -> Array:
-    """Noise covariance (modes, modes), nm^2, in one exposure of Table 4's star: own photometry, 1 e- of read noise."""
+    """Noise covariance (modes, modes), nm^2, in an exposure of Table 4's star: own photometry, 1 e- of read noise."""
     light_e = electrons(STAR, TABLE4_EXPOSURE_S)
     return covariance_nm2(signal, light_e, TABLE4_READ_NOISE_E, modes, estimator)
 

@@ -37,9 +37,9 @@ TABLE3_NONLINEARITY_WAVES = {14: 2.1e-4, 20: 3.1e-4}
 to the paper's input, which adds to the noise in quadrature. A constant, so that a search does not compute it.
 
 Four sets of 60 or 100 wavefronts, with each packaged layout behind the disk and two behind the bowtie, gave means of
-1.6e-4 to 2.1e-4 with 14 modes and 3.0e-4 to 3.8e-4 with 20, root mean squares of 2.0e-4 to 2.6e-4 and 3.4e-4 to 4.4e-4,
-and up to 1.2e-3 for a single wavefront. All means are within 25 % of the constants, and the root mean squares at most
-42 % above them."""
+1.6e-4 to 2.1e-4 waves with 14 modes and 3.0e-4 to 3.8e-4 with 20, root mean squares of 2.0e-4 to 2.6e-4 and 3.4e-4 to
+4.4e-4, and up to 1.2e-3 for a single wavefront. All means are within 25 % of the constants, and the root mean squares
+at most 42 % above them."""
 
 RELAY_SAMPLES = 128
 """Samples across the relay pupil."""
@@ -129,7 +129,7 @@ def hole_fields(optics: Optics, hole: Hole) -> SingleComplex:
     n = optics.groups[0].relay.shape[1]
     u = pupil_axis(n)
     rows, columns = _covered(n, y, diameter), _covered(n, x, diameter)
-    radius = np.sqrt(max(diameter**2 / 4.0 - 1.0 / (12.0 * n**2), 0.0))  # a soft rim adds this much to the area
+    radius = np.sqrt(max(diameter**2 / 4.0 - 1.0 / (12.0 * n**2), 0.0))  # smaller, as the soft rim adds to the area
     open_part = np.clip((radius - np.hypot(u[rows, None] - y, u[columns] - x)) * n + 0.5, 0.0, 1.0)
     open_part = open_part.astype(np.float32)
     parts = []
@@ -145,7 +145,7 @@ class SamCandidate:
 
     Attributes:
         optics: The optics before the mask.
-        fields: (fields, samples, samples) sum of `hole_fields` over its holes, amplitude.
+        fields: (fields, samples, samples) sum of `hole_fields` over the holes of the mask.
     """
 
     optics: Optics

@@ -17,15 +17,15 @@ from lowfc.design.sam_merit import RELAY_SAMPLES, Optics, SamCandidate, hole_fie
 Orbit = tuple[int, int, int]
 """One hole of an orbit: centre x, y and diameter, in thousandths of the pupil's diameter; `images` adds the other."""
 
-UNIT = 1000  # lengths are integers, this many to the diameter of the pupil
+UNIT = 1000  # the pupil's diameter, in the unit of all lengths
 SMALLEST = ceil(UNIT / RELAY_SAMPLES)
 """Smallest diameter of a hole: one sample of the relay pupil, since a smaller hole may cover none."""
 SYMMETRIES = ("none", "x", "y")
 BLOCK = 200
 """Steps of a block; the state of a chain can be stored after each block."""
 
-_ATTEMPTS = 60  # random placements of a hole
-_PACKINGS = 200  # random starting layouts
+_ATTEMPTS = 60  # attempts to place a hole at random
+_PACKINGS = 200  # attempts to find a random starting layout
 _WARM, _COLD = 0.01, 0.0003  # temperature at the start and at the end, in relative change of the merit
 _FAR, _NEAR = 80.0, 1.5  # scale of the moves at the start and at the end, thousandths of the pupil's diameter
 
@@ -171,7 +171,7 @@ def _packed(rng: np.random.Generator, bounds: Bounds) -> tuple[Orbit, ...] | Non
 def _move(
     rng: np.random.Generator, bounds: Bounds, orbits: list[Orbit], progress: float
 ) -> tuple[int | None, Orbit | None] | None:
-    """A random change: index of the removed orbit, and the added orbit, either or both; None if none was found.
+    """A random change: index of the removed orbit, and the added orbit (either may be None); None if there is none.
 
     `progress` is the fraction of the chain's steps made so far.
     """
@@ -219,7 +219,7 @@ def _anywhere(rng: np.random.Generator, bounds: Bounds, paired: bool, diameter: 
 
 
 def _on_axis(bounds: Bounds, orbit: Orbit, paired: bool) -> Orbit:
-    """The orbit; a single hole is moved onto the symmetry axis, if there is one."""
+    """The orbit; if it is a single hole, it is moved onto the symmetry axis, if there is one."""
     x, y, diameter = orbit
     if bounds.symmetry == "none" or paired:
         return orbit

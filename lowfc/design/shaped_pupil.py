@@ -29,7 +29,7 @@ FOCAL_MASK_RADIUS = 4.0
 """Radius of the disk for which the fraction of the light is reported, in lambda / D."""
 
 MIN_OPEN_AREA = 0.01
-"""Smallest open fraction of the circle: below it a request counts as infeasible, since a closed mask is dark."""
+"""Open fraction of the circle below which a request counts as infeasible: a closed mask is dark everywhere."""
 
 SYMMETRIES = ("quarter", "octant")
 
@@ -44,13 +44,13 @@ class Request:
     Attributes:
         inner: Inner radius of the dark zone, in lambda/D.
         outer: Outer radius of the dark zone, in lambda/D.
-        half_angle_deg: Half-angle of the dark zone from the x axis, on both sides, in degrees; 90: all around.
+        half_angle_deg: Angle of the dark zone's edges from the x axis, in degrees; 90 for a zone all around the star.
         contrast: Largest intensity in the dark zone, relative to the star's peak; checked every 0.1 lambda/D and on its
             edges.
         limit: Contrast in the linear programs, as a fraction of the required one; below 1 it saves rounds.
         cells: Cells in half the diameter: 8, 16, 32, 64, 128 or 256.
         step: Spacing of the first grid of points, in lambda/D.
-        symmetry: quarter: about both axes; octant: mask and zone also about the diagonals, 3 to 9 times faster.
+        symmetry: quarter: about both axes; octant: mask and zone also about the diagonals, solved 3 to 9 times faster.
         rounds: Largest number of programs for each number of cells.
     """
 
@@ -168,7 +168,7 @@ def exchange(request: Request) -> Iterator[Round]:
             maxima, maxima_signs = _maxima(quarter, request, level * (1 + 1e-6))
             points, signs = np.concatenate([points, maxima]), np.concatenate([signs, maxima_signs])
             multipliers = np.concatenate([multipliers, np.zeros(len(maxima))])
-        if is_open:  # drop each point's limit on the other sign of the field: with more cells it hardly ever acts
+        if is_open:  # drop the limits on the sign that the field lacks at a point: with more cells they hardly ever act
             relevant = (signs * _field_at(quarter, points) > 0) | (multipliers > 0)
             points, signs, multipliers = points[relevant], signs[relevant], multipliers[relevant]
 
@@ -227,7 +227,7 @@ def nearest_feasible(request: Request) -> tuple[float | None, float | None]:
 
     Returns:
         Inner angle, lambda/D (at most twice as large), and contrast (at most 1e5 times as large), each with everything
-        else unchanged; None if even the largest is infeasible.
+        else unchanged; None if even the largest value is infeasible.
     """
     coarse = replace(request, cells=_cell_numbers(request)[0])
     inners = [round(v, 6) for v in request.inner + 0.1 * np.arange(1, round(10 * request.inner) + 1)]
@@ -244,7 +244,7 @@ def is_feasible(request: Request) -> bool:
 
 
 def _last_inner(outer: float) -> float:
-    """Largest inner radius of a zone with a point of the fine grid, in lambda/D; 1e-9 for rounding."""
+    """Largest inner radius with which a zone has a point of the fine grid, in lambda/D; 1e-9 is for rounding."""
     return outer - FINE_STEP + 1e-9
 
 

@@ -1,8 +1,8 @@
 """Tolerances of drift and vibration lines, from theory: the size that a loop can correct to an allowed contrast.
 
 A mode drifts as a random walk of variance D per frame. Its mean over an exposure of e frames is measured with noise of
-variance n; a command takes effect at the next frame. For the residual r at the start of a frame, the drift d during the
-frame, and the mean m over the exposure of the drift since the start of the frame,
+variance n; a command takes effect at the next frame. Let r be the residual at the start of a frame, d the drift during
+the frame, and m the mean over the exposure of the drift since the start of the frame. Then
 
     r' = r + d - g (r + m + noise),    var d = D, var m = D e / 3, cov(d, m) = D e / 2
 
@@ -35,7 +35,7 @@ KINDS: tuple[Kind, ...] = ("integrator", "lqg")
 DELAY = 1.0
 """Delay of the loop, frames: a command takes effect at the next frame."""
 _MIN_DRIFT = 1e-12  # drift in the model of a filter for a line alone, nm^2 per frame
-_GAINS = np.geomspace(0.01, 1.0, 30)
+_GAINS = np.geomspace(0.01, 1.0, 30)  # gains of the integrators that are compared
 _LINE_RATIOS = np.geomspace(1e-15, 1e10, 76)  # ratios of a line's variance to a frame's noise variance
 
 
@@ -44,7 +44,7 @@ class Drift:
     """A drift corrected by an integrator.
 
     Attributes:
-        step_nm2: D, variance of the drift per frame.
+        step_nm2: D, variance of the drift's step from frame to frame.
         gain: Gain of the integrator.
     """
 

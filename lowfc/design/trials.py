@@ -9,8 +9,8 @@ from lowfc.arrays import Array
 from lowfc.optics.chain.zernike import noll_to_orders
 
 LITERAL_WAVES = (0.04, 0.016)
-"""Bounds of the paper's Sect. 3.1, waves rms, for radial degrees 1 and 2, and for higher ones: a coefficient lies
-between minus and plus its bound."""
+"""Bounds of coefficients in the paper's Sect. 3.1, waves rms, for radial degrees 1 and 2, and for higher degrees: a
+coefficient lies between minus and plus its bound."""
 
 _BLOCK = 100  # wavefronts in memory at once
 
@@ -33,7 +33,7 @@ def random_wavefronts(rng: np.random.Generator, count: int, nolls: Sequence[int]
 
 def noisy_e(rng: np.random.Generator, mean_e: ArrayLike, read_noise_e: float) -> Array:
     """An exposure (any shape) in electrons, with photon noise, read noise and rounding to whole electrons."""
-    mean_e = np.maximum(mean_e, 0.0)  # rounding errors of a twin give values below zero in dark pixels
+    mean_e = np.maximum(mean_e, 0.0)  # a twin's rounding errors make some dark pixels negative
     return np.asarray(np.rint(rng.poisson(mean_e) + read_noise_e * rng.standard_normal(mean_e.shape)))
 
 
@@ -44,7 +44,7 @@ def gram(basis: Array) -> Array:
 
 
 def input_rms(gram: Array, bounds: Array) -> float:
-    """Rms over the open pupil, if coefficients are uniform between minus and plus bounds (modes,); in their unit."""
+    """Rms over the open pupil of coefficients uniform between minus and plus bounds (modes,), in their unit."""
     return float(np.sqrt(np.sum(np.diag(gram) * bounds**2) / 3.0))
 
 

@@ -2,8 +2,8 @@
 
 With the field E = E0 + i k sum a_j E_j - k^2 / 2 sum a_j a_l E_jl, the intensity's second order in a has two terms:
 the squared first-order field, and the product of the second-order field with E0. For tilt behind the shaped pupil the
-second term cancels most of the first: without it, tilt would add 7 (x) or 9 (y) times as much. The intensity's first
-order averages to zero over a dark zone on both sides of the star.
+second term cancels most of the first, which alone would be 7 (x) or 9 (y) times as large as the sum. The intensity's
+first order averages to zero over a dark zone on both sides of the star.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.science_camera import ScienceCamera
 from lowfc.optics.chain.zernike import mode_group, zernikes
 
-_BEYOND_QUADRATIC = 0.1
+_BEYOND_QUADRATIC = 0.1  # relative difference between full images and the quadratic form
 _IMAGE_ROUNDING = 1e-13  # contrast; means of images in single precision are exact to some 1e-14 behind a shaped pupil
 _DRAWS = 24  # random wavefronts compared, each with both signs
 
@@ -39,7 +39,7 @@ class ModalContrast:
         self._camera = ScienceCamera(coronagraph, noll, wavelength_nm, int(np.ceil(self._zone.outer)))
 
     def by_image(self, modes_nm: Array | Single) -> float:
-        """Mean contrast of the dark zone with a wavefront (modes,), nm rms, including the coronagraph's own."""
+        """Mean contrast of the dark zone with a wavefront (modes,), nm rms, including that of a flat wavefront."""
         return self._camera.mean_contrast(self._camera.image(modes_nm), self._zone)
 
     def by_mode(self, covariance_nm2: Array) -> Array:
@@ -59,7 +59,7 @@ class ModalContrast:
 
 
 def beyond_quadratic(form: float, image: float) -> bool:
-    """Whether the contrast added in full images differs from the quadratic form's by over 10 %, rounding aside."""
+    """Whether the contrast added in full images differs from that of the form by over 10 % and not only by rounding."""
     return abs(form - image) > max(_BEYOND_QUADRATIC * abs(image), _IMAGE_ROUNDING)
 
 

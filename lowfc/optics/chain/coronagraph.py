@@ -1,7 +1,7 @@
 """The science image of a coronagraph: contrast for a given wavefront (Subedi et al. 2015, Fig. 1).
 
 A shaped pupil is imaged directly; a Lyot coronagraph has an opaque mask and a stop in between. Contrast is
-intensity divided by the star's peak off the mask with a flat wavefront; angles are in lambda / D (see `grid`).
+intensity divided by the peak of the star off the mask with a flat wavefront; angles are in lambda / D (see `grid`).
 """
 
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ from lowfc.optics.chain.pupil import aberrated
 
 SAMPLES_PER = 4
 """Samples per lambda / D. Two represent the image, but not the sharp edge of a zone, on which the contrast added by
-tilt depends: behind the shaped pupil two samples give a tenth of the value with 32 samples, four are within 20 %, for
-other modes too."""
+tilt depends: behind the shaped pupil, two samples give a tenth of the value with 32 samples. Four are within 20 % of
+this value, for other modes too."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Coronagraph:
         return float((self.pupil if self.lyot is None else self.pupil * self.lyot.stop).sum())
 
     def behind(self, field: Array | Complex) -> Array | Complex:
-        """Field (n, n) in front of the science camera for a field after the pupil's mask."""
+        """Field (n, n) in the last pupil before the science camera, for a field (n, n) after the pupil's mask."""
         return field if self.lyot is None else self.lyot.behind(field)
 
 

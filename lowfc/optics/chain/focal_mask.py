@@ -23,8 +23,8 @@ def disk(samples_per: int = 8, radius: float = 4.0, inner_radius: float = 0.0) -
 def phase_spot(samples_per: int = 8, radius: float = 4.0, spot_diameter: float = 1.06) -> Complex:
     """The disk with a central spot that delays by a quarter of a wave, as in a Zernike sensor.
 
-    Samples on the spot's edge are area-weighted means of both sides: by default the spot is only 8.5 samples wide. The
-    phase is assumed equal at all wavelengths, and the spot's physical size fixed.
+    Samples on the spot's edge are area-weighted means of both sides, since by default the spot is only 8.5 samples
+    wide. The delay is a quarter of a wave at every wavelength, and the physical size of the spot is fixed.
 
     Args:
         samples_per: Samples per lambda0 / D.

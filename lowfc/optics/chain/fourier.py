@@ -20,13 +20,13 @@ def kernel(image_samples: int, samples_per: int, pupil_samples: int, scale: floa
 
 
 def to_image(pupil: NDArray[np.inexact], image_samples: int, samples_per: int, scale: float) -> Complex:
-    """Complex (image_samples, image_samples) amplitude in the focal plane of a square pupil field; conserves energy."""
+    """Complex amplitude (image_samples, image_samples) in the focal plane of a square pupil field; conserves energy."""
     matrix = kernel(image_samples, samples_per, pupil.shape[0], scale)
     return (scale / pupil.size) * (matrix @ pupil @ matrix.T)
 
 
 def to_pupil(image: Complex, pupil_samples: int, samples_per: int, scale: float) -> Complex:
-    """Complex (pupil_samples, pupil_samples) amplitude in the pupil after a square focal-plane field.
+    """Complex amplitude (pupil_samples, pupil_samples) in the pupil that follows a square focal-plane field.
 
     The inverse of `to_image`, except for the light that falls outside the focal-plane field.
     """

@@ -10,8 +10,8 @@ from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.zernike import zernikes
 
 _TIKHONOV = 1e-4
-"""Regularisation, relative to the mean diagonal of the normal matrix. With 1e-6 the mean error of the fit would be the
-same, 1.2 %, but the largest command of a mode, at the edge, would be up to three times as large."""
+"""Regularisation, relative to the mean diagonal element of the normal matrix. With 1e-6 the mean error of the fit would
+be the same, 1.2 %, but the largest command of a mode, at the edge, would be up to three times as large."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Mirror:
         rows: Actuators along y.
         columns: Actuators along x.
         pitches_per_pupil: Actuator pitches across the pupil's diameter.
-        coupling: Surface at the next actuator divided by that at the poked one.
+        coupling: Surface at the neighbour of a poked actuator divided by the surface at the poked actuator.
         shift_pitches: Offset of the actuators from the centre, equal along x and y.
     """
 
@@ -73,7 +73,7 @@ def active_actuators(mirror: Mirror) -> Mask:
 def modes_to_actuators(mirror: Mirror, nolls: Sequence[int], usable: Mask | None = None) -> Array:
     """Modes-to-actuators matrix (M2C) of Zernike modes: nm of surface at the actuators per nm rms of wavefront.
 
-    A regularised least-squares fit over the circle. It includes the 1/2 of reflection: the wavefront is twice
+    It is a regularised least-squares fit over the circle. It includes the 1/2 of reflection: the wavefront is twice
     the surface.
 
     Args:

@@ -30,7 +30,7 @@ def circle_with_bar(samples: int, width: float, angle_deg: float) -> Array:
 def prolate(samples: int, mask_radius: float) -> Array:
     """Apodised pupil (samples, samples) of an apodised-pupil Lyot coronagraph, 1 at its centre.
 
-    The circular prolate function: of all pupils it concentrates the most light within the focal-plane mask.
+    It is the circular prolate function: of all pupils it concentrates the most light within the focal-plane mask.
 
     Args:
         samples: Points across the diameter.
@@ -108,6 +108,6 @@ def aberrated(pupil: Array, opd_nm: NDArray[np.floating], wavelength_nm: float) 
     """Field (n, n) after a pupil of a wavefront (n, n) in nm; ValueError if it is not sampled like the pupil."""
     if opd_nm.shape != pupil.shape:
         raise ValueError(f"a wavefront must be sampled like the pupil, {pupil.shape}, got {opd_nm.shape}")
-    field, transmits = np.zeros(pupil.shape, np.complex128), pupil != 0  # only a fifth of a shaped pupil
+    field, transmits = np.zeros(pupil.shape, np.complex128), pupil != 0  # a fifth of a shaped pupil
     field[transmits] = pupil[transmits] * np.exp((2j * np.pi / wavelength_nm) * opd_nm[transmits])
     return field

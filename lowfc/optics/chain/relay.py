@@ -1,4 +1,4 @@
-"""The optics between the focal-plane mask and the detector, which distinguish the sensors."""
+"""The optics between the focal-plane mask and the detector, in which the kinds of sensor differ."""
 
 from dataclasses import dataclass
 from functools import lru_cache

@@ -70,7 +70,7 @@ def transmission(layout: Layout, samples: int, points: int = 1) -> Array:
     Args:
         layout: The holes.
         samples: Samples across the pupil.
-        points: Points evaluated across a sample in each direction; 1 for its centre only.
+        points: Points that are evaluated across a sample in each direction; 1 for the sample's centre only.
 
     Raises:
         ValueError: A hole is so small that no evaluated point lies in it.

@@ -12,15 +12,15 @@ from lowfc.optics.chain.fourier import kernel
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.zernike import zernikes
 
-_LYOT_SQUARE = 4  # pupil samples across a cell
+_LYOT_SQUARE = 4  # pupil samples across a cell, for a Lyot coronagraph
 
 
 class ScienceCamera:
     """Contrast of a coronagraph, in single precision, from modal wavefronts.
 
     The field is summed over the open cells of the pupil only: the wavefront is evaluated at each cell's centre, and the
-    Fourier kernel is summed over the cell's samples. Cells have 2 x 2 samples if the four samples of every such
-    cell are equal, as in the package's shaped pupil, otherwise one sample. For a Lyot coronagraph cells have 4 x 4
+    Fourier kernel is summed over the cell's samples. Cells have 2 x 2 samples if the pupil is constant within
+    each, as in the package's shaped pupil, otherwise one sample. For a Lyot coronagraph cells have 4 x 4
     samples, over which the pupil is averaged.
 
     Attributes:

@@ -5,15 +5,15 @@ import scipy.fft
 
 from lowfc.arrays import Array
 
-_SPECTRUM = 0.0229  # power spectrum of the phase at one cycle per D for r0 = D, rad^2 per (cycle per D)^2
+_SPECTRUM = 0.0229  # phase spectrum at one cycle per D for r0 = D, rad^2 per (cycle per D)^2
 
 
 def kolmogorov(rng: np.random.Generator, samples: int, width: int = 4) -> Array:
     """Screen (samples, samples) with spectrum f^-11/3, at the samples of a pupil, in radians for r0 = D.
 
-    It is cut from a periodic screen. Waves longer than the periodic screen are missing, so tilt is too small: over a
-    circle an infinite screen has 0.90 of its 1.03 rad^2 in tilt (Noll 1976); here tilt has about 0.3 rad^2 at width 4
-    and 0.04 at width 1. At width 4 the orders above tilt are nearly complete.
+    It is cut from a periodic screen. Waves longer than the periodic screen are missing, so tilt is too small. Over a
+    circle, an infinite screen has a variance of 1.03 rad^2, of which tilt has 0.90 (Noll 1976); here tilt has about 0.3
+    rad^2 at width 4 and 0.04 at width 1. At width 4 the orders above tilt are nearly complete.
 
     Args:
         rng: Generator of all random numbers.

@@ -49,7 +49,7 @@ class Sensor:
         if isinstance(self.relay, Defocus):
             reach = (self.pixels * self.binning + self.focal_mask.shape[0]) / (2.0 * self.samples_per)
             # The sum over the focal plane aliases where the phase of chirp times field advances by a wave per sample.
-            spare = 2.0  # cycles per lambda0 / D: 0.5 for the edge of the pupil, the rest for short wavelengths
+            spare = 2.0  # cycles per lambda0 / D: 0.5 for the edge of the pupil, 1.5 for short wavelengths
             least = reach / (self.samples_per - spare)
             if self.relay.distance < least:
                 raise ValueError(
@@ -167,8 +167,8 @@ def reference(sensor: Sensor, band: Band | None = None) -> Array:
 def response(sensor: Sensor, basis: NDArray[np.floating], band: Band | None = None) -> Array:
     """H = dI/da (pixels squared, modes), in the units of `image` per nm of each mode.
 
-    H = 2 (2 pi / lambda) Re{E0 conj(i E_k)}, where E0 is the field of the flat wavefront, and E_k that of the pupil
-    times mode k: eq. (12) with the 2 of eq. (9), so that I - I0 = H a.
+    H = 2 (2 pi / lambda) Re{E0 conj(i E_k)}, where E0 is the field of the flat wavefront, and E_k the field of the
+    pupil times mode k: eq. (12) with the 2 of eq. (9), so that I - I0 = H a.
 
     Args:
         sensor: The optics.

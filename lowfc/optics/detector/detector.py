@@ -21,7 +21,7 @@ class Detector:
         full_well_e: Charge at which the output saturates; after the multiplication register if there is one.
         bit_depth: Bits of the converter, at most 16.
         em_gain: Mean gain of the multiplication register; 1 for a detector without one.
-        clock_induced_charge_e: Mean spurious electrons per pixel and frame, before the register.
+        clock_induced_charge_e: Mean number of spurious electrons per pixel and frame, before the register.
         exact: Draw the electrons of every pixel from the Poisson distribution. If False, faint pixels are drawn from
             a precomputed table where one applies, in a third of the time; see `expose`.
     """
@@ -67,8 +67,9 @@ def expose(detector: Detector, electrons: NDArray[np.floating], rng: np.random.G
 
     If `noise_table_of` returns a table, it yields the digital numbers of pixels with a mean below `FAINT_E` electrons.
     Their distribution is exact at means that are multiples of 1/64 electron. Between these the mean is exact and the
-    variance too large by at most 6e-5 electrons squared. A chi-square test of a million draws does not detect this from
-    a read noise of half an electron on; with less, two electrons in a pixel with a mean near 0.005 are too frequent.
+    variance too large by at most 6e-5 electrons squared. With a read noise of half an electron or more, a chi-square
+    test of a million draws does not detect this; with less, two electrons in a pixel with a mean near 0.005 are too
+    frequent.
 
     Args:
         detector: The detector.
@@ -97,7 +98,7 @@ def expose(detector: Detector, electrons: NDArray[np.floating], rng: np.random.G
 
 @lru_cache(maxsize=4)
 def noise_table_of(detector: Detector) -> NoiseTable | None:
-    """The table from which `expose` draws faint pixels, cached; None if all are drawn step by step."""
+    """The table from which `expose` draws faint pixels, cached; None if all pixels are drawn step by step."""
     if detector.exact or detector.em_gain > 1.0:
         return None
     return noise_table(detector.gain_e_per_dn, detector.read_noise_e, detector.bias_dn, saturation_dn(detector))

@@ -23,7 +23,7 @@ _ENTRIES = 1 << _ENTRIES_BITS
 _FRACTION_BITS = 16  # resolution of the probability of rounding up
 _MAX_TABULATED_E = 64  # electrons, exclusive; a pixel with a mean of 24 e- reaches 64 once in 1e11 frames
 _TAIL = 8.0  # tabulated range of the read noise, standard deviations
-_WIDEST = 256  # largest range of digital numbers that is tabulated
+_WIDEST = 256  # most digital numbers that are tabulated
 _MIN_NOISE_DN = 0.05  # the table divides by the read noise, which may be 0
 _REMAINDER = 65535  # never a tabulated digital number, since those are below saturation
 
@@ -34,7 +34,7 @@ class NoiseTable:
 
     Attributes:
         entries: (means, entries) digital numbers, all equally likely; `_REMAINDER` where `remainder` decides.
-        remainder: (means, numbers) cumulative distribution of the rest of each probability, less than 1/1024.
+        remainder: (means, numbers) cumulative distribution of what the entries leave of each probability: below 1/1024.
         first_dn: Digital number of the first column of `remainder`.
     """
 

@@ -41,7 +41,7 @@ class Photometry:
 
 
 def electrons(photometry: Photometry, exposure_s: float) -> float:
-    """Electrons per exposure of all light through the open circle: the factor from an image to electrons."""
+    """Electrons per exposure from all light through the open circle: the factor from fractions of it to electrons."""
     area_m2 = np.pi / 4.0 * photometry.diameter_m**2
     flux = PHOTONS_PER_S_M2_NM * 10.0 ** (-0.4 * photometry.magnitude)
     collected = flux * area_m2 * photometry.bandwidth_nm * exposure_s

@@ -49,7 +49,7 @@ def sensor_functions(sensor: Sensor, scale: float, guards: int) -> Array:
     Args:
         sensor: The optics.
         scale: lambda0 / lambda.
-        guards: Number of functions in addition to the bandwidth times the width of the sensor.
+        guards: Number of functions beyond the product of the bandwidth and the width of the sensor.
     """
     band = _half_band(sensor, scale)
     return prolates(sensor.samples, band, min(int(np.ceil(2.0 * band * sensor.samples)) + guards, sensor.samples))
@@ -171,7 +171,7 @@ def _waves(sensor: Sensor, scale: float) -> Array:
 
 
 def _kernels(sensor: Sensor, scale: float, functions: Array) -> Array:
-    """Kernel (functions, n) from the relay pupil to the functions on the sensor, with the scale of one axis."""
+    """Kernel (functions, n) from the relay pupil to the functions on the sensor, scaled for one axis."""
     samples = sensor.pupil.shape[0]
     angles = 2.0 * np.pi * scale * np.outer(image_axis(sensor.samples, sensor.samples_per), pupil_axis(samples))
     kernels = functions.T @ np.cos(angles)

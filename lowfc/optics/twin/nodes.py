@@ -7,11 +7,11 @@ from lowfc.optics.chain.grid import pupil_axis
 
 
 def node_axis(nodes: int, order: int) -> Array:
-    """Coordinates of the nodes along one axis, in pupil diameters: `nodes` across the pupil, order/2 guards each side.
+    """Coordinates of the nodes along an axis, pupil diameters: `nodes` across the pupil, order / 2 guards on each side.
 
     Args:
         nodes: Number of nodes across the diameter; the spacing is 1 / nodes.
-        order: Points of the interpolation stencil, even, so that every stencil is centred.
+        order: Number of points of the interpolation stencil: even, so that every stencil is centred.
 
     Raises:
         ValueError: The order is odd or below 2.

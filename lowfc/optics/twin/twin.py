@@ -25,10 +25,10 @@ class TwinSpec:
 
     Attributes:
         nodes: Pupil nodes across the diameter.
-        order: Points of the interpolation from the nodes, even.
+        order: Number of points of the interpolation from the nodes; even.
         rank: Retained modes of the operator for a focal-plane mask with the area of a disk of radius 4 lambda0 / D and
             an aperture mask. `build` increases it for a larger mask, for a bright pupil, and without an aperture mask.
-        guards: Prolate functions along each axis in addition to the field's bandwidth times the sensor's width.
+        guards: Prolate functions along each axis beyond the product of the field's bandwidth and the sensor's width.
     """
 
     nodes: int = 32
@@ -71,8 +71,8 @@ class Twin:
         spec: Degree of compression.
         axis: Coordinates of the nodes along one axis, with guards, in pupil diameters.
         used: Flat indices of the used nodes in the square grid of the axis (rows = y, columns = x).
-        area_weights: (used,) weights of sum 1 for means over the open pupil: its samples (transmission above 0.5) count
-            equally.
+        area_weights: (used,) weights of sum 1 for means over the open pupil, whose samples (transmission above 0.5)
+            count equally.
         operators: One operator for each wavelength.
         to_pixels: (pixels, points) matrix from intensities at the points of an axis to pixels.
         operator_hash: Hexadecimal digest of all inputs of the build.
@@ -215,7 +215,7 @@ class _Stage:
         to_modes = np.sqrt(operator.weight) * operator.to_modes
         self._to_modes = to_modes.astype(np.float32)
         self._flat_modes = to_modes.sum(axis=1).astype(np.float32)[:, None]
-        # A real matrix multiplies the columns of real and imaginary parts, a complex one the complex numbers.
+        # A real matrix multiplies columns of real and of imaginary parts, a complex matrix columns of complex numbers.
         self._unit = np.dtype(np.complex64 if np.iscomplexobj(operator.to_coefficients) else np.float32)
         self._to_coefficients = np.ascontiguousarray(operator.to_coefficients, self._unit)
         basis, phases = _real_basis(operator.basis)

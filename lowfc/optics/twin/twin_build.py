@@ -49,8 +49,8 @@ def build(
     area_weights = _adjoint(to_samples, sensor.pupil > 0.5).ravel()[used]
     points, to_pixels = _intensity_sampling(sensor, spec, max(scales))
     area = np.count_nonzero(mask) / sensor.samples_per**2
-    # Two thirds of the modes are degrees of freedom of the light, proportional to the mask's area; a third is for its
-    # edge. An aperture mask blurs the contribution of the faintest modes; without one, a third more modes are needed.
+    # Two thirds of the modes are degrees of freedom of the light, proportional to the mask's area; a third is for the
+    # mask's edge. An aperture mask blurs the contribution of the faintest modes; without one, a third more is needed.
     # A pupil that is bright up to its edge excites the faintest modes and needs a tenth more.
     needed = spec.rank if isinstance(sensor.relay, ApertureMask) else 4 * spec.rank / 3
     if sensor.pupil.mean() > 0.5:
@@ -85,7 +85,7 @@ def build(
 
 
 def _adjoint(to_samples: Array, weights: Mask) -> Array:
-    """Weights on the square grid of nodes equivalent to weights on interpolated values at the pupil's samples."""
+    """Weights on the square grid of nodes equivalent to these weights on values interpolated at the pupil's samples."""
     return np.asarray(to_samples.T @ weights.astype(np.float64) @ to_samples)
 
 

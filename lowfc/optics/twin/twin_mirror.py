@@ -1,9 +1,9 @@
 """The wavefront of a deformable mirror on the twin's nodes, computed in microseconds.
 
 The nodes are too coarse for the print-through of the actuators: sampled there, it would alias to low orders. In the
-full optics, the shaped pupil's fine structure mixes some of it into low orders. The nodes therefore carry a
-least-squares fit of the surface. A small correction makes the field at the sensor, to first order, that of the full
-surface.
+full optics, the shaped pupil's fine structure mixes some of the print-through into low orders. The nodes therefore
+carry a least-squares fit of the surface. A small correction makes the field at the sensor, to first order, that of the
+full surface.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from lowfc.optics.twin.nodes import interpolation
 from lowfc.optics.twin.twin import Twin
 
 _FIT_RCOND = 0.01  # least relative singular value of the fit; excludes guard nodes that hardly affect the pupil
-_MIN_SINGULAR_VALUE = 0.01  # relative to the largest; smaller ones do not reduce the correction's error
+_MIN_SINGULAR_VALUE = 0.01  # relative to the largest; smaller values do not reduce the correction's error
 
 
 @dataclass(frozen=True, eq=False)
