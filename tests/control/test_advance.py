@@ -1,4 +1,4 @@
-"""`advance`: refusals, frame timeouts, requests, no jumps and no wind-up."""
+"""`advance`: refused frames, frame timeouts, requests, and a command without jumps and wind-up."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -116,7 +116,7 @@ def test_without_a_calibration_a_frame_gives_a_step_and_no_command() -> None:
         ({"pixels": image_with_saturated(9)}, (Rejection.SATURATED,)),
     ],
 )
-def test_a_frame_is_used_up_to_each_limit(changes: dict[str, object], reasons: tuple[Reason, ...]) -> None:
+def test_a_frame_is_refused_only_beyond_a_limit(changes: dict[str, object], reasons: tuple[Reason, ...]) -> None:
     _, (outputs,) = feed(DEFAULTS, running(), frame(6, WAVE_NM, **changes))
     assert outputs.step.reasons == reasons
     assert (outputs.step.error_nm is None) is bool(reasons)
@@ -154,7 +154,7 @@ def test_one_missing_frame_advances_the_history_by_one() -> None:
     assert not np.array_equal(newest, middle)
 
 
-def test_frames_of_a_restarted_camera_are_used_with_an_event() -> None:
+def test_frames_of_a_restarted_camera_are_used_and_raise_an_event() -> None:
     before = running()
     restarted = frame(0, WAVE_NM, sequence=frame_sequence(0, START + 60), time_ns=(START + 60) * 10**9)
     state, all_outputs = feed(DEFAULTS, before, restarted)
@@ -313,7 +313,7 @@ def test_a_request_with_more_leaks_than_modes_is_refused_without_computing_their
     assert limiting_gain.cache_info().misses == before
 
 
-def test_a_mode_that_a_request_names_twice_has_one_value() -> None:
+def test_a_mode_that_a_request_names_twice_takes_one_value() -> None:
     for name in ("gain", "limit", "offset"):
         requests = ask(name, 0.1, modes=(2, 2)), ask(name, 0.1, 0.2, modes=(2, 2))
         _, (one_value, two_values) = feed(DEFAULTS, loaded(DEFAULTS), *requests)
@@ -339,8 +339,8 @@ def test_in_open_loop_the_command_holds() -> None:
 def test_a_loaded_calibration_does_not_make_the_mirror_jump(noll: tuple[int, ...]) -> None:
     before = running()
     state, (outputs,) = feed(DEFAULTS, before, Load(0, calibration(noll, scale=2.0), "another"))
-    beyond = [] if noll == NOLL else ["SHAPE_ADOPTED"]  # the part outside the new modes
-    assert names([outputs]) == ["CALIBRATION_LOADED", *beyond]
+    adoption = [] if noll == NOLL else ["SHAPE_ADOPTED"]  # of the part outside the new modes
+    assert names([outputs]) == ["CALIBRATION_LOADED", *adoption]
     assert np.array_equal(state.loop.actuators_nm, before.loop.actuators_nm)
     _, (outputs,) = feed(DEFAULTS, state, Tick(0, 0))
     assert np.array_equal(outputs.command.actuators_nm, before.loop.actuators_nm)
@@ -379,7 +379,7 @@ def test_an_implausible_modal_command_is_not_adopted(reported_nm: float) -> None
         (np.full(GRID, np.nan, np.float32), "20 of its 20 actuators have no finite position"),
     ],
 )
-def test_a_shape_of_another_mirror_is_not_adopted(shape: np.ndarray, why: str) -> None:
+def test_a_shape_of_another_grid_or_with_values_not_finite_is_not_adopted(shape: np.ndarray, why: str) -> None:
     state = loaded(DEFAULTS)
     after, (outputs,) = feed(DEFAULTS, state, MirrorShape(0, shape, np.zeros(3, np.float32)))
     assert names([outputs]) == ["MIRROR_REFUSED"]
@@ -387,7 +387,7 @@ def test_a_shape_of_another_mirror_is_not_adopted(shape: np.ndarray, why: str) -
     assert after.loop is state.loop
 
 
-def test_the_modal_limit_holds_for_each_mode_and_does_not_wind_up() -> None:
+def test_each_modal_limit_is_kept_and_causes_no_wind_up() -> None:
     setup = settings(limit_nm=(20.0, 5.0))
     state = loaded(setup)
     for count in range(1, 101):  # a hundred frames of an error far beyond the limits
@@ -400,7 +400,7 @@ def test_the_modal_limit_holds_for_each_mode_and_does_not_wind_up() -> None:
     assert names([outputs]) == ["LIMIT_CLEARED"]
 
 
-def test_after_saturation_the_stored_command_is_the_limited_one() -> None:
+def test_when_the_stroke_limit_acts_the_stored_modal_command_is_the_limited_one() -> None:
     setup = settings(limits=replace(DEFAULTS.limits, stroke_nm=5.0), limit_nm=(150.0, 150.0))
     state, events = loaded(setup), []
     for count in range(1, 61):
@@ -420,7 +420,7 @@ def test_after_saturation_the_stored_command_is_the_limited_one() -> None:
 
 
 def test_saturated_pixels_hardly_affect_the_estimate() -> None:
-    """This also holds for a star that is brighter than expected."""
+    """The star is 1.3 times as bright as expected."""
     plain = TOY.pixels(WAVE_NM, 1.3 * FLUX_DN)
     saturated = plain.copy()
     saturated.flat[[3, 17]] = SATURATION_DN

@@ -16,7 +16,7 @@ def warmup_after(*arrivals_ns: int, period_ns: int = PERIOD_NS) -> CacheWarmup:
 
 
 def due_ns(warmup: CacheWarmup, now_ns: int) -> int:
-    """Time from START_NS to the next warm-up, ns."""
+    """Time of the next warm-up, ns after START_NS, like `now_ns`."""
     return now_ns + warmup.wait_ns(START_NS + now_ns)
 
 
@@ -33,14 +33,14 @@ def test_there_is_one_warm_up_before_each_frame_after_the_first() -> None:
     assert warmup.wait_ns(start_ns) is None
 
 
-def test_a_warm_up_that_would_delay_the_frame_is_omitted() -> None:
+def test_a_warm_up_too_close_to_the_next_frame_is_omitted() -> None:
     late_ns = START_NS + PERIOD_NS - MIN_LEAD_NS + 1
     warmup = warmup_after(0)
     assert not warmup.due(late_ns)
     assert warmup.wait_ns(late_ns) is None
 
 
-def test_a_late_frame_moves_the_schedule_little() -> None:
+def test_a_slightly_late_frame_hardly_moves_the_schedule() -> None:
     late = warmup_after(0, PERIOD_NS + LEAD_NS // 4)
     assert due_ns(late, 2 * PERIOD_NS - 900_000) == pytest.approx(2 * PERIOD_NS - LEAD_NS, abs=3_000)
 
@@ -52,7 +52,7 @@ def test_a_frame_that_is_early_or_far_off_resets_the_schedule(shift_ns: int) -> 
 
 
 @pytest.mark.parametrize("scale", [0.9995, 1.0005])
-def test_the_schedule_follows_a_camera_with_a_different_clock_rate(scale: float) -> None:
+def test_the_schedule_follows_a_camera_whose_clock_is_faster_or_slower(scale: float) -> None:
     arrivals_ns = [round(frame * PERIOD_NS * scale) for frame in range(3000)]
     next_ns = due_ns(warmup_after(*arrivals_ns), arrivals_ns[-1])
     assert next_ns == pytest.approx(arrivals_ns[-1] + PERIOD_NS * scale - LEAD_NS, abs=30_000)

@@ -1,4 +1,4 @@
-"""A loop with a wrong or restarted camera or without a calibration: when it may close, and what it does meanwhile."""
+"""Loops with a wrong or restarted camera or without a calibration: when they may close, and what they do until then."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -50,8 +50,8 @@ def open_loop_after(*inputs: Input) -> State:
     return feed(DEFAULTS, state, *inputs)[0]
 
 
-def test_changed_camera_settings_open_the_loop() -> None:
-    """A bias below the dark is allowed: clock-induced charge and dark current make the difference."""
+def test_camera_settings_that_differ_from_the_calibrations_open_the_loop() -> None:
+    """A bias below the dark is no difference: the dark also contains clock-induced charge and dark current."""
     state, all_outputs = feed(DEFAULTS, loaded(DEFAULTS), frame(1), CAMERA)
     assert (state.mode, names(all_outputs)) == (LoopMode.CLOSED, [])
     assert feed(DEFAULTS, state, replace(CAMERA, time_ns=9)) == (state, [Outputs()])
@@ -100,7 +100,7 @@ def test_the_camera_is_compared_with_the_calibrations_settings() -> None:
         (replace(CAMERA, bias_dn=float("nan")), ["bias_dn"]),
     ],
 )
-def test_only_differences_beyond_the_noise_are_changes(now: CameraSettings, different: list[str]) -> None:
+def test_only_differences_beyond_the_tolerances_are_changes(now: CameraSettings, different: list[str]) -> None:
     assert [line.split()[0] for line in changes(now, CAMERA)] == different
 
 
@@ -134,7 +134,7 @@ def test_the_loop_is_not_closed_while_frames_are_refused() -> None:
     assert ask(feed(DEFAULTS, state, frame(9))[0], "close")[1].accepted
 
 
-def test_clear_forgets_the_newest_frame() -> None:
+def test_after_a_clear_frames_older_than_the_newest_frame_are_used() -> None:
     newer = frame(1, sequence=frame_sequence(1, START + 86_000))
     state, _ = feed(DEFAULTS, loaded(DEFAULTS), CAMERA, frame(1), newer, CAMERA)
     state, (outputs,) = feed(DEFAULTS, state, frame(2))
@@ -154,7 +154,7 @@ def test_a_frame_from_the_future_does_not_change_the_newest_sequence() -> None:
     assert after.step.reasons == ()
 
 
-def test_safe_mode_is_in_the_commands_and_restored_from_the_mirror() -> None:
+def test_commands_report_safe_mode_and_a_restarted_controller_takes_it_over_from_the_mirror() -> None:
     state, _ = ask(loaded(DEFAULTS), "safe")
     _, (outputs,) = feed(DEFAULTS, state, frame(1))
     assert outputs.command.safe
@@ -197,7 +197,7 @@ def play(state: State, table: Single, basis: Single = BASIS) -> State:
 
 
 def surfaces(all_outputs: list[Outputs]) -> Single:
-    """Actuators (frames, actuators) of the commands."""
+    """Actuators (frames, actuators) of the commands, nm of surface."""
     return np.array([outputs.command.actuators_nm.reshape(-1) for outputs in all_outputs])
 
 
@@ -252,7 +252,7 @@ def test_an_idle_loop_holds_the_mirror_and_safe_relaxes_it() -> None:
     assert state.mode is LoopMode.IDLE
 
 
-def test_safe_mode_from_before_the_start_remains() -> None:
+def test_safe_mode_latched_before_the_controller_started_remains() -> None:
     safe = settings(start_mode=LoopMode.SAFE)
     state, all_outputs = feed(safe, State(), MirrorShape(0, np.full(GRID, 30, np.float32), np.zeros(0, np.float32)))
     assert names(all_outputs) == ["NOT_CALIBRATED", "MODE_CHANGED", "SAFED"]
@@ -293,7 +293,7 @@ def test_a_measured_calibration_of_another_frame_size_opens_the_loop() -> None:
     assert state.mode is LoopMode.OPEN
 
 
-def test_a_probe_sequence_advances_with_refused_frames() -> None:
+def test_a_probe_sequence_advances_also_with_refused_frames() -> None:
     closed, _ = feed(DEFAULTS, State(), Load(0, calibration(), "test"), *(frame(count) for count in range(1, 4)))
     state = play(closed, np.ones((5, 1), np.float32), 0.1 * BASIS)
     dark = np.zeros(SHAPE, np.uint16)
@@ -317,7 +317,7 @@ def test_a_frame_timeout_ends_the_probe_sequence() -> None:
 
 
 @pytest.mark.parametrize(("rows", "request_", "events"), [(5, "status", 1), (5, "stop", 0), (1, "status", 0)])
-def test_the_early_end_of_a_probe_sequence_is_one_event(rows: int, request_: str, events: int) -> None:
+def test_a_probe_sequence_that_ends_early_raises_one_event(rows: int, request_: str, events: int) -> None:
     restarted = frame(0, pixels=MISFIT_IMAGE, sequence=frame_sequence(0, START + 60))
     ends = Tick(0, DEFAULTS.frame_timeout_ns + 1), MirrorReport(0, "does not answer"), restarted
     state = play(idle(), np.ones((rows, 1), np.float32))

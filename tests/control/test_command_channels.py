@@ -1,4 +1,4 @@
-"""Channels, offset, probe sequences, steps, reset and laws: additions to the loop's command and their effect."""
+"""Channels, offset, probe sequences, steps, reset and laws: their effect on the command and on the wavefront."""
 
 from dataclasses import replace
 
@@ -94,7 +94,7 @@ def test_a_channel_is_applied_within_the_slew_limit_and_not_undone() -> None:
 
 @pytest.mark.parametrize("delay_frames", [1.0, 1.5, 2.0])
 def test_the_shift_of_the_zero_point_is_delayed_like_the_mirror(delay_frames: float) -> None:
-    """While a channel is approached, no frame measures an error, whatever the delay."""
+    """While the mirror moves to a channel's shape, no frame measures an error, whatever the delay."""
     loop = ToyLoop(replace(DEFAULTS, delay_frames=delay_frames), LoopMode.OPEN)
     loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(60.0))
     loop.run(30, np.zeros(3))
@@ -237,7 +237,7 @@ def test_an_inconsistent_probe_sequence_is_refused(fields: dict[str, object], wh
     assert loop.state.loop is before.loop
 
 
-def test_pokes_of_single_actuators_may_together_exceed_the_stroke() -> None:
+def test_the_stroke_limits_each_actuator_of_a_probe_sequence_and_not_the_sum_of_all_pokes() -> None:
     loop = ToyLoop(mode=LoopMode.OPEN)
     loop.run(2)
     one_each = np.eye(ACTUATORS, dtype=np.float32)
@@ -323,7 +323,7 @@ def test_reset_removes_the_modal_command_within_the_slew_limit(mode: LoopMode) -
     assert np.allclose(loop.surfaces[-1], channel, atol=0.01) is (mode is LoopMode.OPEN)
 
 
-def test_a_foreign_shape_of_the_mirror_is_adopted_as_a_channel() -> None:
+def test_a_shape_that_the_loop_did_not_command_is_adopted_as_a_channel() -> None:
     loop = ToyLoop()
     shape_nm = dark_hole(30.0) + (TOY.modes_to_actuators @ DISTURBED).reshape(GRID).astype(np.float32)
     loop.process_input(MirrorShape(0, shape_nm, np.zeros(0, np.float32)))
@@ -339,7 +339,7 @@ def test_a_foreign_shape_of_the_mirror_is_adopted_as_a_channel() -> None:
 
 
 def test_a_law_takes_over_and_returns_control_without_a_jump() -> None:
-    """A linear law equal to the integrator: the mirror moves alike under both, within 0.5 nm."""
+    """The linear law equals the integrator: with either, the mirror moves in the same way within 0.5 nm."""
     loop, plain = ToyLoop(), ToyLoop()
     for each in (loop, plain):
         each.ask("gain", values=(0.4,))
@@ -420,7 +420,7 @@ def test_a_law_for_another_loop_is_refused() -> None:
     assert slow.ask("law", law=linear(law, rate_hz=501.0)).accepted
 
 
-def test_loading_another_calibration_moves_nothing() -> None:
+def test_another_calibration_does_not_move_the_mirror() -> None:
     loop = ToyLoop()
     loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(20.0))
     loop.run(60)

@@ -27,10 +27,10 @@ from lowfc.programs.core.start_up import settings_at_start
 from tests.support import toy
 
 RATE_HZ = 1000.0
-SAME_NM = 2e-4  # allowed: sums have another order on each processor; 1.5e-4 nm with AVX-512, in a million frames
-LIMITED_NM = 5e-4  # allowed if a limit acts: the neighbour limit divides by small differences; 2.4e-4 nm on an AMD EPYC
+SAME_NM = 2e-4  # allowed difference: the order of sums depends on the processor; 1.5e-4 nm with AVX-512 in 10^6 frames
+LIMITED_NM = 5e-4  # the same if the neighbour limit acts, which divides by small differences; 2.4e-4 nm on an AMD EPYC
 ROUNDINGS = 10
-"""Allowed difference, in float32 roundings of a step's largest number (up to 500 nm without a saturation limit)."""
+"""Allowed difference, in float32 roundings of a step's largest number: up to 500 nm if no pixel counts as saturated."""
 COMMAND_ARRAYS = 2
 """Number of arrays of a step that are commands."""
 BAD_IMAGES = ("dark", "faint", "saturated pixel", "saturated pixels", "frozen", "aberrated")
@@ -112,7 +112,7 @@ class Bench:
         ][rng.integers(9)]
 
     def pixels(self) -> Pixels:
-        """An image, rarely a bad one."""
+        """An image; 4 % of the images are bad in one of the ways of `BAD_IMAGES`."""
         rng = self.rng
         kind = str(rng.choice(BAD_IMAGES)) if rng.random() < 0.04 else "usual"
         self.repeats = max(self.repeats - 1, 4 * (kind == "frozen"))
@@ -154,7 +154,7 @@ class Bench:
             assert getattr(self.state, name) == getattr(self.reference_state, name)
 
     def amplification(self) -> float:
-        """Factor by which the projection onto modes amplifies rounding of the actuators, if a limit acted."""
+        """Factor by which the projection onto modes, after a limit acted, amplifies rounding of the actuators."""
         return max(1.0, float(np.abs(self.state.loop.inverse).sum(axis=1).max()))
 
     def compare(self, outputs: Outputs, expected: Outputs) -> None:
@@ -182,7 +182,7 @@ class Bench:
 
 
 def _numbers(outputs: Outputs) -> list[Single]:
-    """Modal command and actuators, then error and pseudo-open-loop modes; empty if there are none."""
+    """Modal command, actuators, error and pseudo-open-loop modes, nm; an array that the step lacks is empty."""
     step, command = outputs.step, outputs.command
     arrays = (step.command_nm, None if command is None else command.actuators_nm, step.error_nm, step.pol_nm)
     return [np.zeros(0, np.float32) if array is None else array for array in arrays]
@@ -238,7 +238,7 @@ def test_the_kernel_in_use_is_reported_by_an_event_and_is_numpy_if_the_fused_ste
         assert event.call_args.kwargs["advice"].startswith(advice)
 
 
-def test_several_threads_give_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_fused_step_gives_the_same_bytes_with_one_and_with_several_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     size = Size(side=100, modes=13, mirror_side=8)
     calibration, frames = random_calibration(size, configuration(size, RATE_HZ))
     reference_nm, pixels = calibration.reconstructor @ calibration.reference, frames[0].ravel()

@@ -31,7 +31,7 @@ from tools.modal_bench import ModalBench
 RATE_HZ = 1000.0
 SETUP = settings(guard=True, gain=(0.5, 0.3), rate_hz=RATE_HZ)
 BEFORE = SETTLING_FRAMES + FADING_FRAMES - 1
-"""Frames before the first compared one."""
+"""Number of frames before the first frame in which the guard compares."""
 SPANS = Spans.at(RATE_HZ)
 NOISE_NM = 2 * np.random.default_rng(1).standard_normal((3_000, len(NOLL)))
 SWAY_NM = 20 * np.sin(2 * np.pi * 7 / RATE_HZ * np.arange(3_000)[:, None] + [0, 1, 2])
@@ -95,7 +95,7 @@ def test_without_a_law_or_with_guard_off_nothing_is_guarded() -> None:
 
 
 @pytest.mark.parametrize(("rate_hz", "wait_s"), [(RATE_HZ, 10), (1.0, 100)])  # at 1 Hz a block takes 100 s
-def test_the_takeover_has_an_event_and_no_jump(rate_hz: float, wait_s: int) -> None:
+def test_a_takeover_raises_an_event_and_the_command_does_not_jump(rate_hz: float, wait_s: int) -> None:
     setup, faded = replace(SETUP, rate_hz=rate_hz), Spans.at(rate_hz).cross_fade
     state = with_law(replace(BAD_TILT, rate_hz=rate_hz), setup)
     _, state = run(state, BEFORE + WORSE_BLOCKS * SPANS.block - 1)
@@ -145,7 +145,7 @@ def test_a_loop_is_judged_to_amplify_if_its_error_is_large_and_not_due_to_a_larg
 
 
 @pytest.mark.parametrize(("law_nm2", "void"), [(3.0, False), (2.0, True)], ids=["not better", "void"])
-def test_one_bad_block_restarts_the_wait(law_nm2: float, void: bool) -> None:
+def test_one_block_in_which_the_law_is_not_better_restarts_the_waiting_time(law_nm2: float, void: bool) -> None:
     group = Group(overruled=True, takeovers=1, blocks=SPANS.better - 1, usual_nm2=100.0)
     group, _ = group.judged((10.0, law_nm2, 100.0), SPANS, void=void)
     assert (group.overruled, group.blocks) == (True, 0)
@@ -169,7 +169,7 @@ def test_the_law_returns_once_it_would_be_far_better() -> None:
     assert spans.better * spans.block <= overruled_steps < len(steps)
 
 
-def test_closing_and_loading_reset_the_guard() -> None:
+def test_closing_the_loop_and_loading_a_law_reset_the_guard() -> None:
     _, state = run(with_law(BAD_TILT), BEFORE + (WORSE_BLOCKS + 2) * SPANS.block)
     assert overruled(state)[0]
     for requests in ([Request(0, "open"), Request(0, "close")], [Request(0, "law", law=BAD_TILT)]):
@@ -189,7 +189,7 @@ def test_missing_and_refused_frames_hold_the_virtual_command() -> None:
     assert np.abs(guarded.loop.history_nm[0] - unguarded.loop.history_nm[0]).max() > 1
 
 
-def test_a_virtual_law_has_the_command_of_a_real_one() -> None:
+def test_a_virtual_law_has_the_command_of_a_law_that_drives_the_mirror() -> None:
     frames = BEFORE + (WORSE_BLOCKS + 3) * SPANS.block
     _, state = run(with_law(BAD_TILT), frames)
     setup = replace(SETUP, guard=False)
@@ -215,7 +215,7 @@ def test_probe_sequences_resets_and_limits_suspend_the_comparison() -> None:
 
 
 def test_a_decoded_guard_continues_identically() -> None:
-    """It does so in every phase: compared, in the cross-fade, overruled with a virtual law."""
+    """It does so in every phase: while it compares, in the cross-fade, and while an overruled law is virtual."""
     state, frames_done = with_law(BAD_TILT), 0
     for until in (
         BEFORE + 150,
@@ -248,8 +248,8 @@ def short_settling(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tools.guard._BEFORE", 1_000)
 
 
-def test_modal_noise_agrees_with_images() -> None:
-    """They agree on the noise of an open loop, and on the residual tilt of the integrator with the reaction wheel."""
+def test_a_simulation_of_modes_agrees_with_a_simulation_of_images() -> None:
+    """They agree in the noise of an open loop, and in the residual tilt of the integrator with the reaction wheel."""
     config = configured(**{"disturbance.preset": "quiet"}, **SMALL_MIRROR)
     calibration_ = calibrated(config)
     bench = Bench(config, calibration_)
@@ -310,5 +310,5 @@ def test_with_shifted_lines_the_residual_is_at_most_a_tenth_above_the_integrator
 @pytest.mark.slow
 @pytest.mark.parametrize("magnitude", [0.0, 2.0, 5.0])
 def test_a_good_law_is_never_overruled(magnitude: float) -> None:
-    """This run has ten minutes; `python -m tools.measure guard` runs as long for each of twenty seeds (some hours)."""
+    """One seed is simulated for ten minutes; `python -m tools.measure guard` simulates twenty seeds in some hours."""
     assert times_overruled(case("reaction-wheel", magnitude), 21) == 0

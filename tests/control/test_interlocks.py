@@ -1,4 +1,4 @@
-"""Interlocks on bench values, and permits: they only make the loop safer."""
+"""Interlocks on bench values, and permits: when they act, and that they only make the loop safer."""
 
 import numpy as np
 import pytest
@@ -67,7 +67,7 @@ def test_an_interlock_acts_on_its_condition_and_if_configured_on_a_missing_or_ol
 
 
 def test_an_interlock_holds_and_releases_the_command_at_the_next_frame() -> None:
-    """It acts at random times. Bench reports are encoded as in a log; a replay of all inputs gives the same steps."""
+    """It acts at random times. A replay of all inputs, with bench reports encoded as in a log, gives the same steps."""
     setup, rng = settings_under(Action.HOLD), np.random.default_rng(5)
     state = replayed_state = running(setup)
     count, acting, flips, logged = 5, False, 0, []
@@ -153,7 +153,7 @@ def test_a_loop_that_starts_closed_is_held_if_an_interlock_acts_before_or_after_
     assert all_outputs[-1].step.error_nm is not None
 
 
-def test_only_a_change_of_the_condition_is_a_logged_input() -> None:
+def test_a_bench_report_is_a_logged_input_only_if_an_interlock_begins_or_ceases_to_act() -> None:
     setup = settings_under(Action.HOLD, "above", 3.0)
     state = running(setup)
     acting, _ = advance(setup, state, mask(4.0))

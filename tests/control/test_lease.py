@@ -1,4 +1,4 @@
-"""Reservations of the loop, remarks on unwise values, and the texts of replies and events."""
+"""Leases of the loop, remarks on unwise values, and the texts of replies and events."""
 
 from dataclasses import replace
 
@@ -98,7 +98,7 @@ def test_close_reports_whether_the_loop_was_closed_already() -> None:
 
 @pytest.mark.parametrize("name", ["close", "gain", "play", "load"])
 @pytest.mark.parametrize("ended", [True, False])
-def test_a_former_holder_is_refused_with_the_reason(name: str, ended: bool) -> None:
+def test_requests_of_a_former_holder_are_refused_with_the_reason(name: str, ended: bool) -> None:
     state = applied(reserved_loop(), Request(SECOND_NS, "pause"))[0] if ended else loaded(DEFAULTS)
     _, outputs = applied(state, Request(2 * SECOND_NS, name, values=(0.1,), lease_id=MINE))
     check_reply(outputs, False, ("operator asked to pause" if ended else "did the controller restart"))
@@ -120,7 +120,7 @@ def test_status_and_note_do_not_end_a_lease(name: str) -> None:
     assert not state.conditions.lease.ended
 
 
-def test_a_lease_has_one_holder_who_alone_can_release_it() -> None:
+def test_a_lease_has_one_holder_and_only_the_holder_can_release_it() -> None:
     state = reserved_loop()
     after, outputs = applied(state, Request(SECOND_NS, "lease", values=(5.0,), text="somebody", lease_id=12))
     check_reply(outputs, False)
@@ -151,7 +151,7 @@ def test_an_invalid_lease_is_refused(fields: dict[str, object], why: str) -> Non
     check_reply(outputs, False, why)
 
 
-def test_a_lease_ends_after_its_number_of_frames() -> None:
+def test_a_lease_ends_after_the_frames_of_its_duration() -> None:
     """A lease of 1 s is in force for 1000 frames at 1 kHz."""
     state = played(reserved_loop(1.0), 5000)
     state, all_outputs = feed(DEFAULTS, state, *(frame(count) for count in range(4, 1004)))
@@ -248,7 +248,7 @@ def test_an_offset_of_a_mode_without_gain_has_a_remark() -> None:
         assert (":" in reply.text) == bool(remark)
 
 
-def test_the_remark_on_gains_begins_above_the_highest_gain() -> None:
+def test_a_gain_has_a_remark_if_it_is_above_the_highest_gain_within_the_margins() -> None:
     highest = highest_gain(DEFAULTS.delay_frames)
     texts = [answer(loaded(DEFAULTS), "gain", factor * highest)[1].text for factor in (0.999, 1.001)]
     assert ["lowfc tune" in text for text in texts] == [False, True]

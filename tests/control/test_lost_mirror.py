@@ -1,4 +1,4 @@
-"""A mirror that does not follow commands: the loop holds with an event, and continues when it follows again."""
+"""A mirror that does not follow commands: the loop raises an event, and holds until the mirror follows again."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def test_a_lost_mirror_moves_the_command_back_to_its_last_shape() -> None:
     np.testing.assert_allclose(state.loop.history_nm[0], expected_nm, atol=1e-3)
 
 
-def test_moving_back_keeps_the_slew_limit() -> None:
+def test_the_move_back_to_the_mirrors_last_shape_keeps_the_slew_limit() -> None:
     state = running(frames=30)
     far = MirrorShape(0, np.full(GRID, -600, np.float32), np.zeros(len(NOLL), np.float32))
     after, (_, outputs) = feed(DEFAULTS, state, MirrorReport(0, LOST.fault, far), *frames(31))
@@ -77,14 +77,14 @@ def test_a_lost_mirror_ends_the_probe_sequence_and_refuses_others() -> None:
     check_reply(all_outputs[-1], False, "does not answer")
 
 
-def test_safe_flattens_a_lost_mirror() -> None:
+def test_safe_mode_commands_flat_to_a_lost_mirror() -> None:
     state, all_outputs = feed(DEFAULTS, running(frames=30), LOST, Request(0, "safe"), *frames(*range(31, 60)))
     check_reply(all_outputs[1], True)
     assert not all_outputs[-1].command.actuators_nm.any()
     assert state.mode is LoopMode.SAFE
 
 
-def test_a_mirror_gets_no_command_before_it_reports_and_does_not_jump() -> None:
+def test_a_mirror_gets_no_command_before_its_first_report_and_does_not_jump_at_the_first_command() -> None:
     shape = MirrorShape(0, np.full(GRID, 20, np.float32), np.zeros(0, np.float32))
     absent, timeout = MirrorReport(0, "has not reported yet"), Tick(0, DEFAULTS.frame_timeout_ns + 1)
     state, all_outputs = feed(DEFAULTS, loaded(DEFAULTS), absent, *frames(1, 2), timeout)

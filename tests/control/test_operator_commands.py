@@ -1,4 +1,4 @@
-"""Random inputs: requests are answered, nothing jumps, the limits hold, and the log is sufficient for a replay."""
+"""Random inputs: all requests are answered, the mirror does not jump, limits are kept, and a log can be replayed."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -31,6 +31,7 @@ TIGHT: dict[str, object] = {"limit_nm": (40.0, 15.0), "max_saturated_pixels": 0}
 CALIBRATION = identified(calibration())
 TO_MODES = np.linalg.pinv(CALIBRATION.modes_to_actuators)
 OTHERS = tuple(identified(calibration(noll, scale)) for noll, scale in ((NOLL, 1.1), ((2, 3), 1.0), ((2,), 0.9)))
+"""Calibrations that replace `CALIBRATION`: another response, and fewer modes."""
 OTHER_MIRROR = identified(replace(CALIBRATION, grid=(5, 4)))
 CALIBRATIONS_BY_ID = {each.id: each for each in (CALIBRATION, *OTHERS, OTHER_MIRROR)}
 HUGE = 3e38
@@ -44,8 +45,8 @@ def laws(delay_frames: float, noll: tuple[int, ...]) -> tuple[LinearLaw, ...]:
     def integrator_of(gain: float, modes: tuple[int, ...] = noll) -> LinearLaw:
         return linear(law_of(gain, modes=len(modes)), modes, delay_frames)
 
-    of_pol = replace(integrators([(0.2, 0.01)] * len(noll), "pol", delay_frames), noll=noll)
-    return integrator_of(0.3), of_pol, integrator_of(3.0), integrator_of(0.3, (7, 8))
+    pol_law = replace(integrators([(0.2, 0.01)] * len(noll), "pol", delay_frames), noll=noll)
+    return integrator_of(0.3), pol_law, integrator_of(3.0), integrator_of(0.3, (7, 8))
 
 
 class Script:
@@ -57,7 +58,7 @@ class Script:
         self.count, self.start = 0, START
 
     def number(self) -> float:
-        """A number, mostly sensible; otherwise as after a typing error or from a faulty program."""
+        """A number: mostly sensible, otherwise as after a typing error or from a faulty program."""
         odd = (np.nan, np.inf, -np.inf, HUGE, -HUGE, 1e-42, -1.0, 1e6)
         return float(self.rng.choice(odd)) if self.rng.random() < 0.15 else float(self.rng.uniform(0, 1.2))
 
@@ -166,7 +167,7 @@ class Script:
 
 @dataclass
 class Run:
-    """Inputs and outputs of a run, the outputs as bytes; its newest state, also as a message."""
+    """Inputs of a simulated loop, its outputs as bytes, its newest state, and this state as a message."""
 
     state: State
     message: wire.ControllerState
@@ -187,7 +188,7 @@ def serialised(input_: Input, outputs: Outputs, state: State) -> bytes:
 
 
 def checked_advance(setup: Settings, run: Run, input_: Input) -> Outputs:
-    """Process an input, its image read-only; check purity, limits, and that a refused request changes nothing."""
+    """Process an input; check that this has no side effects, keeps the limits, and changes nothing if it is refused."""
     if isinstance(input_, Frame) and input_.pixels is not None:
         input_.pixels.flags.writeable = False
     state = run.state
@@ -269,7 +270,7 @@ def replayed(setup: Settings, state: State, inputs: list[Input]) -> tuple[State,
 
 
 def check(setup: Settings, names: list[str], pauses: list[int], seed: int) -> Run:
-    """Run, and replay: from the beginning, and from a decoded state in the middle."""
+    """Simulate a loop, then replay its inputs: from the beginning, and from a decoded state in the middle."""
     run = random_run(setup, names, pauses, seed)
     assert sum(run.counts.values()) == len(names), "every request is answered"
     start_state, _ = advance(setup, State(), Load(0, CALIBRATION, "a test"))

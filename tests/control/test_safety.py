@@ -1,4 +1,4 @@
-"""The limits of the mirror hold exactly, in float64, for any requested shape; tests catch mutations of the source."""
+"""The limits of the mirror hold exactly, in float64, for any requested shape; tests detect mutations of the source."""
 
 import importlib.util
 import pkgutil
@@ -33,9 +33,9 @@ def boundary_values(bounds: tuple[float, ...]) -> list[float]:
     return values + [-value for value in values]
 
 
-EDGES = boundary_values((LIMITS.stroke_nm, LIMITS.slew_nm, LIMITS.neighbour_nm))
-finite = st.one_of(st.sampled_from(EDGES), st.floats(-2000, 2000, width=32))
-anything = st.one_of(finite, st.floats(width=32), st.sampled_from([np.inf, -np.inf, np.nan, 1e38, -3.4e38]))
+BOUNDARY_VALUES = boundary_values((LIMITS.stroke_nm, LIMITS.slew_nm, LIMITS.neighbour_nm))
+finite = st.one_of(st.sampled_from(BOUNDARY_VALUES), st.floats(-2000, 2000, width=32))
+any_value = st.one_of(finite, st.floats(width=32), st.sampled_from([np.inf, -np.inf, np.nan, 1e38, -3.4e38]))
 
 
 def within_limits(shape: Single) -> Single:
@@ -53,7 +53,7 @@ allowed_shapes = hnp.arrays(np.float32, GRID, elements=finite.map(np.float32)).m
 
 
 @settings(max_examples=400, deadline=None, derandomize=True)
-@given(previous=allowed_shapes, requested=hnp.arrays(np.float32, GRID, elements=anything.map(np.float32)))
+@given(previous=allowed_shapes, requested=hnp.arrays(np.float32, GRID, elements=any_value.map(np.float32)))
 def test_the_limits_hold_for_any_requested_shape(previous: Single, requested: Single) -> None:
     assert violations(LIMITS, previous, previous) == []
     limited = limit(LIMITS, previous, requested)
@@ -83,8 +83,8 @@ def test_steps_are_within_the_limits_for_any_values_of_the_limits(
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(previous=allowed_shapes, fraction=st.floats(0, 1))
-def test_a_move_within_the_limits_is_unchanged(previous: Single, fraction: float) -> None:
-    """A move well within all limits is not changed, and no reason is reported."""
+def test_a_move_within_the_limits_is_not_changed(previous: Single, fraction: float) -> None:
+    """The move is well within all limits; no reason is reported."""
     requested = (previous * np.float32(fraction)).astype(np.float32)
     assume(np.abs(requested.astype(np.float64) - previous).max() < LIMITS.slew_nm - 0.01)
     assume(np.abs(requested).max() < LIMITS.stroke_nm - 0.01)
@@ -139,7 +139,7 @@ def test_the_arguments_are_not_modified() -> None:
     previous=hnp.arrays(np.float32, GRID, elements=st.floats(-3000, 3000, width=32)),
     requested=hnp.arrays(np.float32, GRID, elements=finite.map(np.float32)),
 )
-def test_a_shape_outside_the_limits_comes_back(previous: Single, requested: Single) -> None:
+def test_a_shape_outside_the_limits_returns_to_them(previous: Single, requested: Single) -> None:
     """A shape outside the limits never moves further out, and returns at no more than the slew limit."""
     shape, steps = previous, 0
     while violations(LIMITS, shape, shape):
@@ -159,7 +159,7 @@ def test_a_shape_outside_the_limits_comes_back(previous: Single, requested: Sing
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(previous=st.one_of(allowed_shapes, hnp.arrays(np.float32, GRID, elements=st.floats(-3000, 3000, width=32))))
-def test_relaxing_reaches_flat(previous: Single) -> None:
+def test_repeated_requests_for_flat_reach_flat_within_the_slew_limit(previous: Single) -> None:
     shape, steps = previous, 0
     while shape.any():
         after = limit(LIMITS, shape, np.zeros(GRID, np.float32)).actuators_nm
@@ -316,12 +316,12 @@ def check_modes(module: Any) -> None:
                 assert (after, refusal) == (mode.CLOSED, "")
 
 
-def test_the_checks_pass_on_the_real_source() -> None:
+def test_the_checks_pass_on_the_source_without_a_mutation() -> None:
     check(module_of(SOURCE))
 
 
 @pytest.mark.parametrize("name", MUTATIONS)
-def test_a_mutation_is_caught(name: str) -> None:
+def test_a_mutation_of_the_source_fails_the_checks(name: str) -> None:
     before, after = MUTATIONS[name]
     assert SOURCE.count(before) == 1, f"{before!r} is {SOURCE.count(before)} times in the source: rewrite this mutation"
     with np.errstate(all="ignore"), pytest.raises((AssertionError, ArithmeticError, ValueError)):

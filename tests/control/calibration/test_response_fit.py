@@ -1,4 +1,4 @@
-"""H, I0, delay, dark and R on synthetic frames, and the probe sequences that measure them."""
+"""H, I0, delay, dark and R measured on synthetic frames, and the probe sequences for these measurements."""
 
 from dataclasses import replace
 
@@ -85,7 +85,7 @@ def test_the_number_of_frames_grows_with_the_square_of_the_signal_to_noise_ratio
     assert frames_for_snr(200, 2.0, 4.0) == 10_000
 
 
-def test_an_exposure_sees_the_rows_of_its_delay() -> None:
+def test_an_exposure_sees_the_rows_played_before_it_by_the_delay() -> None:
     table = np.arange(1.0, 6.0)[:, None]
     commanded = np.ones(8, np.bool_)
     one_frame = seen(table, np.array([0.0, 1.0]), np.arange(8), commanded)
@@ -164,8 +164,8 @@ def test_r_is_correct_within_its_standard_error(patterns: np.ndarray) -> None:
     assert np.abs(inverse.matrix @ (fit.reference - I0)).max() < 0.5
 
 
-def test_the_noise_of_h_neither_biases_r_nor_adds_noise() -> None:
-    """H is measured so briefly that the noise of its pixels is as strong as the modes."""
+def test_the_noise_of_a_measured_h_neither_biases_r_nor_adds_noise_to_it() -> None:
+    """H is measured so briefly that the noise of its pixels is as strong as the response to the modes."""
     fit = measured(poke_patterns(MODES, 0.3), 10)
     variance = I0 / FLUX_E
     from_noisy_h = reconstruct(I0, fit.response, None, GOOD, FLUX_E, 0.0)
@@ -223,7 +223,7 @@ def test_an_outlying_cycle_hardly_affects_the_mean() -> None:
     assert errors == pytest.approx(error / np.sqrt(8), rel=0.25)
 
 
-def test_independent_frames_reveal_a_wrong_reconstructor() -> None:
+def test_cycles_not_used_for_a_reconstructor_reveal_whether_it_is_wrong() -> None:
     rng = np.random.default_rng(4)
     error = np.linspace(0.01, 0.04, 8)
     products = np.eye(8) + rng.standard_normal((400, 4, 8, 8)) * error[:, None]
@@ -239,7 +239,7 @@ def test_independent_frames_reveal_a_wrong_reconstructor() -> None:
 
 
 @pytest.mark.parametrize("delay", [1.0, 1.3, 1.5, 2.0, 2.75])
-def test_the_delay_is_measured(delay: float) -> None:
+def test_the_delay_and_the_response_to_a_poke_are_measured(delay: float) -> None:
     poke = dither(1, 8.0, 600, 1, 3).table[:, 0]
     weights = np.concatenate([[0.0], delay_weights(delay)])
     seen_nm = np.convolve(poke, weights)[: len(poke)]
@@ -254,7 +254,7 @@ def test_the_delay_is_measured(delay: float) -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_absent_pokes_are_not_detected(seed: int) -> None:
+def test_a_delay_is_not_measured_without_pokes_or_in_too_few_frames(seed: int) -> None:
     poke = dither(1, 8.0, 600, 1, seed).table[:, 0]
     fractions, _ = fractions_of(exposed(np.zeros((600, MODES)), seed))
     with pytest.raises(ValueError, match="pokes are not seen"):
@@ -270,7 +270,7 @@ def test_a_response_later_than_the_longest_lag_is_an_error() -> None:
         measure_delay(fractions, I0, poke)
 
 
-def test_bad_pixels_are_found() -> None:
+def test_a_dark_shows_hot_noisy_and_dead_pixels_and_light_of_the_star() -> None:
     rng = np.random.default_rng(2)
     frames = np.rint(100 + 2 * rng.standard_normal((200, 6400)))
     frames[:, 10] += 40
@@ -307,7 +307,7 @@ def test_pixels_whose_noise_is_lost_in_rounding_are_not_bad(noise_dn: float, pat
     assert np.count_nonzero(dark.good == 0) == 0
 
 
-def test_r_of_a_computed_h_is_the_reconstructor() -> None:
+def test_reconstruct_gives_the_r_of_reconstructor_for_a_computed_h() -> None:
     for estimator in ("weighted", "pinv"):
         inverse = reconstruct(I0, H, None, GOOD, FLUX_E, 2.0, estimator)
         assert np.allclose(inverse.matrix, reconstructor(I0, H, GOOD, FLUX_E, 2.0, estimator), rtol=1e-6, atol=1e-9)
@@ -387,7 +387,7 @@ def test_a_new_dark_or_reference_keeps_a_fitted_background_and_a_truncation() ->
     masked, plain = (with_dark(original, np.zeros(good.size), good, 1.0, 1.0) for original in (fitted, before))
     background = normalise_flux(masked.reference.astype(float), np.ones((I0.size, 1)), good)[1]
     errors_nm = [np.abs(original.reconstructor @ background).max() for original in (masked, plain)]
-    assert errors_nm[0] < 0.3 * errors_nm[1]  # one pixel of 42 is masked
+    assert errors_nm[0] < 0.3 * errors_nm[1]  # with one pixel of 42 masked
 
 
 def test_r_of_a_measured_calibration_is_not_recomputed_from_noisy_h() -> None:

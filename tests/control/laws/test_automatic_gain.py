@@ -46,12 +46,13 @@ def verdicts(
 
 
 def drift(frames: int, step_nm: float, noise_nm: float, seed: int) -> Array:
+    """Random walks of all modes, with white noise (frames, modes), nm."""
     rng = np.random.default_rng(seed)
     return np.cumsum(rng.normal(0, step_nm, (frames, MODES)), axis=0) + rng.normal(0, noise_nm, (frames, MODES))
 
 
 def test_white_noise_gets_no_gain() -> None:
-    """40 first windows of 30 modes; the noise has long tails, as from few photons: two standard errors are too few."""
+    """The noise of 40 first windows has long tails, as from few photons, so that two standard errors are too few."""
     rng, granted = np.random.default_rng(1), 0
     for _ in range(40):
         noise = rng.normal(0, 10, (300, MODES)) * (1 + 4 * (rng.random((300, 1)) < 0.02))
@@ -60,7 +61,7 @@ def test_white_noise_gets_no_gain() -> None:
 
 
 @pytest.mark.parametrize("leak", [0.0, 0.3])
-def test_the_highest_gain_of_a_bank_keeps_the_margins_with_its_leak(leak: float) -> None:
+def test_the_highest_gain_of_a_bank_is_the_highest_within_the_margins_at_its_leak(leak: float) -> None:
     assert bank(leak=leak).rows[-1] == pytest.approx(highest_gain(1.0, leak))
 
 
@@ -75,7 +76,7 @@ def test_the_leak_of_one_mode_limits_its_own_gain_only() -> None:
 
 
 @pytest.mark.parametrize(("step_nm", "delay_frames"), [(0.1, 1.0), (1.0, 1.0), (1.0, 2.0), (20.0, 1.0)])
-def test_a_drift_gets_nearly_the_best_gain(step_nm: float, delay_frames: float) -> None:
+def test_a_drift_gets_nearly_the_gain_with_the_least_residual(step_nm: float, delay_frames: float) -> None:
     """For a delay of one frame, the residual rms is within 12 % of the least.
 
     Its square is s^2 / (g (2 - g)) from drift steps of s nm rms, plus n^2 g / (2 - g) from noise of n nm rms.
@@ -128,7 +129,7 @@ def test_a_static_aberration_and_a_jump_across_lost_frames_are_not_noise() -> No
     np.testing.assert_allclose(verdict.noise_nm2, 1, rtol=0.3)
 
 
-def test_a_window_without_a_decision_grows() -> None:
+def test_the_window_grows_after_a_verdict_that_changes_no_gain() -> None:
     noise = np.random.default_rng(6).normal(0, 1, (2000, MODES))
     lengths = [verdict.frames for verdict in verdicts(bank(windows=(100, 100)), noise, ZEROS, None, closed=True)]
     assert lengths[0] == 100
@@ -146,7 +147,7 @@ def test_a_new_drift_gets_a_gain_before_the_window_ends() -> None:
     assert (early > 0.01).mean() > 0.9
 
 
-def _vibrating(frames: int, seed: int) -> tuple[Array, Array]:
+def vibrating_tilt(frames: int, seed: int) -> tuple[Array, Array]:
     """Tip and tilt of 20 nm rms, (frames, 2), and 30 modes with 1 nm of noise, one with cross-talk of their squares."""
     rng = np.random.default_rng(seed)
     time = np.arange(frames)[:, None]
@@ -158,23 +159,23 @@ def _vibrating(frames: int, seed: int) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize("closed", [False, True])
 def test_a_mode_with_only_tilt_cross_talk_gets_no_gain(closed: bool) -> None:
-    """Otherwise the loop would put the mean of the cross-talk, 2.7 nm, on the mirror."""
-    tilt_nm, modes_nm = _vibrating(1000, 12)
+    """With a gain, the loop would put the mean of the cross-talk, 2.7 nm, on the mirror."""
+    tilt_nm, modes_nm = vibrating_tilt(1000, 12)
     assert verdicts(bank(), modes_nm, ZEROS, 1.0, tilt_nm, closed=closed)[0].gain[4] == 0
     assert verdicts(bank(), modes_nm, ZEROS, 1.0, closed=closed)[0].gain[4] > 0
 
 
 def test_the_reported_change_excludes_the_cross_talk_margin() -> None:
     """The mode has a true 20 nm and 2.7 nm of cross-talk: a loop would leave a true residual of 2.7 nm."""
-    tilt_nm, modes_nm = _vibrating(1000, 19)
+    tilt_nm, modes_nm = vibrating_tilt(1000, 19)
     modes_nm[:, 4] += 20
     [verdict] = verdicts(bank(), modes_nm, np.full(MODES, 0.1, np.float32), 1.0, tilt_nm)
     assert verdict.change_nm2[4] == pytest.approx(2.7**2 - 20**2, rel=0.05)
 
 
-def test_past_tilt_cross_talk_is_forgotten() -> None:
-    """Squares of tilt are averaged over the blocks of the window, like the modes."""
-    tilt_nm, modes_nm = _vibrating(200, 20)
+def test_tilt_cross_talk_before_a_window_does_not_affect_its_verdict() -> None:
+    """The squares of tilt are averaged over the blocks of the window, like the modes."""
+    tilt_nm, modes_nm = vibrating_tilt(200, 20)
     rng = np.random.default_rng(21)
     bank_ = bank(windows=(100, 10))
     gain = verdicts(bank_, modes_nm, ZEROS, 1.0, tilt_nm)[-1].gain
@@ -183,7 +184,7 @@ def test_past_tilt_cross_talk_is_forgotten() -> None:
 
 
 def test_a_gain_due_to_tilt_cross_talk_is_removed_before_the_window_ends() -> None:
-    tilt_nm, modes_nm = _vibrating(4000, 17)
+    tilt_nm, modes_nm = vibrating_tilt(4000, 17)
     bank_ = bank(windows=(100, 5000))
     gain = verdicts(bank_, drift(100, 1.0, 1.0, 18), ZEROS, 1.0)[0].gain
     assert gain.all()
@@ -195,14 +196,14 @@ def test_a_gain_due_to_tilt_cross_talk_is_removed_before_the_window_ends() -> No
 
 def test_tilt_cross_talk_does_not_favour_a_gain() -> None:
     """A true aberration of -2.72 nm and 2.7 nm of cross-talk cancel in the measurement: a gain corrects nothing."""
-    tilt_nm, modes_nm = _vibrating(1000, 23)
+    tilt_nm, modes_nm = vibrating_tilt(1000, 23)
     modes_nm[:, 4] -= 2.72
     assert verdicts(bank(), modes_nm, ZEROS, 1.0, tilt_nm)[0].gain[4] == 0
 
 
 def test_tilt_cross_talk_follows_a_change_of_the_reconstructor() -> None:
     """With another R, mode 7 contains minus twice mode 4, and so the cross-talk of tilt, which it lacked before."""
-    tilt_nm, modes_nm = _vibrating(5200, 22)
+    tilt_nm, modes_nm = vibrating_tilt(5200, 22)
     mixing = np.eye(MODES)
     mixing[7, 4] = -2
     mixed = (modes_nm @ mixing.T).astype(np.float32)
@@ -219,7 +220,7 @@ def test_tilt_cross_talk_follows_a_change_of_the_reconstructor() -> None:
 
 
 def test_a_drift_is_corrected_in_spite_of_tilt_cross_talk() -> None:
-    tilt_nm, modes_nm = _vibrating(1000, 13)
+    tilt_nm, modes_nm = vibrating_tilt(1000, 13)
     modes_nm += drift(1000, 0.3, 0.0, 14).astype(np.float32)
     assert (verdicts(bank(), modes_nm, ZEROS, 1.0, tilt_nm)[0].gain > 0.01).mean() > 0.9
 
@@ -268,7 +269,7 @@ def test_rows_of_corrected_modes_are_the_map_estimate() -> None:
     assert np.einsum("p,p,p", rows[0], 1 / W, rows[0]) < 0.7 * before[0]  # the mode that resembles an uncorrected one
 
 
-def test_r_is_unchanged_if_all_or_no_modes_are_corrected_or_the_camera_is_unknown() -> None:
+def test_r_stays_if_all_modes_or_no_modes_are_corrected_or_the_camera_is_unknown() -> None:
     calibration, camera = _calibration()
     for prior, settings in ((np.zeros(5), camera), (np.ones(5), camera), (np.array([1.0, 0, 0, 0, 0]), None)):
         assert map_rows(calibration, prior, 5e4, settings, calibration.reconstructor)[0] is calibration.reconstructor

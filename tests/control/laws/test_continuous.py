@@ -21,7 +21,7 @@ from lowfc.control.laws.vibration import Line, Model
 from tools.continuous import RATE_HZ, WHEEL, floor_mas, kalman, residual_mas
 
 FINE = 200
-"""Time steps of a period."""
+"""Number of time steps in a frame period."""
 
 
 def integrator_of_tip(gain: float, delay: float) -> LinearLaw:
@@ -70,8 +70,8 @@ def test_the_floor_is_the_residual_of_the_best_held_value() -> None:
     assert mean_over(np.zeros(1), 1.0)[0] == 1
 
 
-def test_the_residuals_on_the_ideal_wheel_are_known_and_the_best_law_reaches_the_floor() -> None:
-    """Mas per axis, without noise. At one instant of each frame the integrator leaves 2.26 and the best law nothing."""
+def test_laws_leave_the_documented_residuals_on_the_ideal_wheel_and_the_best_law_reaches_the_floor() -> None:
+    """Residuals are in mas per axis, without noise. At instants the integrator leaves 2.26, the best law nothing."""
     instant, blurred = Timing(1, 1, 0), Timing(1, 1, 0.5)
     assert residual_mas(integrator_of_tip(1.11, 1), instant) == pytest.approx(3.528, abs=0.002)
     assert residual_mas(integrator_of_tip(1.11, 1), blurred) == pytest.approx(2.944, abs=0.002)
@@ -81,13 +81,13 @@ def test_the_residuals_on_the_ideal_wheel_are_known_and_the_best_law_reaches_the
         assert residual_mas(lqg([WHEEL], (2,), timing), timing) == pytest.approx(floor_mas(), rel=0.02), timing
 
 
-def test_a_law_that_nulls_another_mean_has_a_larger_residual() -> None:
+def test_a_law_that_nulls_another_mean_than_that_under_its_command_has_a_larger_residual() -> None:
     instant, blurred = Timing(1, 1, 0), Timing(1, 1, 0.5)
     assert residual_mas(kalman(instant, 1.0, 0.0), instant) == pytest.approx(1.44, abs=0.01)
     assert residual_mas(kalman(blurred, 1.0, 0.5), blurred) == pytest.approx(0.954, abs=0.01)
 
 
-def test_the_noise_of_the_command_has_a_closed_form() -> None:
+def test_the_noise_of_an_integrators_command_has_a_closed_form() -> None:
     law, omega = integrator_of_tip(0.4, 1), np.linspace(1e-6, np.pi, 4000)
     power = np.abs(commanded(law, omega, 1))[:, 0] ** 2
     assert np.trapezoid(power, omega) / np.pi == pytest.approx(0.4 / (2 - 0.4), rel=1e-3)
@@ -95,7 +95,7 @@ def test_the_noise_of_the_command_has_a_closed_form() -> None:
 
 @pytest.mark.parametrize("timing", [Timing(1, 1, 0), Timing(1, 1, 0.5), Timing(2, 2, 0.9), Timing(1.3, 1.3, 0.5)])
 def test_means_are_interpolated_from_measurements(timing: Timing) -> None:
-    """This holds for waves up to a quarter of the frame rate."""
+    """The means are those of waves with frequencies up to a quarter of the frame rate."""
     k = np.arange(400)
     for omega in (0.0, 0.04, 0.5, 1.5):
         wave = np.exp(1j * (omega * k + 0.3))
@@ -108,8 +108,8 @@ def test_means_are_interpolated_from_measurements(timing: Timing) -> None:
         assert response[0] == pytest.approx(1)
 
 
-def test_the_continuous_residual_is_recovered_from_instants() -> None:
-    """The disturbance is a wave, and the mirror holds its shape. The residual at the instants alone is smaller."""
+def test_the_continuous_residual_is_recovered_from_the_states_at_instants() -> None:
+    """The disturbance is a wave, and the mirror holds its shape; the residual at the instants alone is smaller."""
     timing, law, k, omega = Timing.of(1, 0.0), integrator_of_tip(0.5, 1), np.arange(3000), 0.3
     wave = np.sqrt(2) * np.cos(omega * k + 1)
     mirror, c = np.zeros_like(wave), 0.0

@@ -22,11 +22,11 @@ from tests.support.toy import frame_sequence, run_toy, settings
 WIDE = {"limits": Limits(7000.0, 7000.0, 7000.0), "limit_nm": (5000.0, 5000.0)}
 DELAYS = [1.0, 1.4, 2.0, 3.0]
 WALK = np.array([15.0, -9.0, 6.0]) + np.cumsum(np.random.default_rng(4).normal(size=(160, 3)), axis=0)
-MISSING = (30, 31, 32, 33, 34, 35, 60, 90, 91)
-DARK = (45, 46, 100, 101, 102, 103)
+MISSING = (30, 31, 32, 33, 34, 35, 60, 90, 91)  # numbers of missing frames
+DARK = (45, 46, 100, 101, 102, 103)  # numbers of refused frames
 
 
-def single(*values: float) -> np.ndarray:
+def one_mode(*values: float) -> np.ndarray:
     """Values (steps, 1) of one mode."""
     return np.array(values, np.float32)[:, None]
 
@@ -46,7 +46,7 @@ def live_run(setup: Settings) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
 
 
 @pytest.mark.parametrize("delay", DELAYS)
-def test_the_logged_gains_reproduce_the_logged_run(delay: float) -> None:
+def test_the_logged_gains_reproduce_the_logged_errors_and_commands(delay: float) -> None:
     """They do so up to float32 rounding in pol = error - seen, with missing and refused frames and modal limits."""
     setup = settings(delay_frames=delay, gain=(0.3, 0.2), leak=(0.01, 0.0), limit_nm=(12.0, 50.0))
     error, pol, command, missing = live_run(setup)
@@ -60,8 +60,8 @@ def test_the_logged_gains_reproduce_the_logged_run(delay: float) -> None:
 
 
 @pytest.mark.parametrize("delay", DELAYS)
-def test_other_gains_reproduce_a_run_with_these_gains(delay: float) -> None:
-    """This holds for a sensor that is linear up to the rounding to DN, here 0.01 nm."""
+def test_other_gains_give_the_errors_and_commands_of_a_loop_with_these_gains(delay: float) -> None:
+    """The sensor is linear up to the rounding to DN, here 0.01 nm."""
     before = settings(delay_frames=delay, gain=(0.3, 0.1), **WIDE)
     after = settings(delay_frames=delay, gain=(0.1, 0.25), leak=(0.02, 0.01), **WIDE)
     _, pol, _, missing = live_run(before)
@@ -76,8 +76,8 @@ def test_other_gains_reproduce_a_run_with_these_gains(delay: float) -> None:
 @pytest.mark.parametrize(
     ("delay", "errors"), [(1.0, [8, 4, 2, 1]), (2.0, [8, 8, 4, 0]), (3.0, [8, 8, 8, 4]), (1.5, [8, 6, 2.5, 0.375])]
 )
-def test_an_integrator_with_gain_one_half_on_a_step(delay: float, errors: list[float]) -> None:
-    pol = single(8, 8, 8, 8)
+def test_an_integrators_errors_after_a_step_agree_with_a_hand_calculation(delay: float, errors: list[float]) -> None:
+    pol = one_mode(8, 8, 8, 8)
     error, command = counterfactual(limited_integrator(law_of(modes=1)), weights(delay), pol, np.zeros(4, np.int64))
     assert error[:, 0].tolist() == errors
     assert command[:, 0].tolist() == np.cumsum([-0.5 * value for value in errors]).tolist()
@@ -88,18 +88,18 @@ def test_any_function_of_state_and_error_is_a_controller() -> None:
         count = state or 0
         return count + 1, -error_nm if count % 2 else np.zeros_like(error_nm)
 
-    _, command = counterfactual(every_other, weights(1.0), single(8, 8, np.nan, 8, 8), np.zeros(5, np.int64))
+    _, command = counterfactual(every_other, weights(1.0), one_mode(8, 8, np.nan, 8, 8), np.zeros(5, np.int64))
     assert command[:, 0].tolist() == [0, -8, -8, 0, -8]
 
 
 def test_an_exposure_sees_the_commands_of_its_delay_also_after_missing_frames() -> None:
-    command, first, missing = single(1, 2, 4, 8), np.array([-1], np.float32), np.array([0, 0, 3, 0])
+    command, first, missing = one_mode(1, 2, 4, 8), np.array([-1], np.float32), np.array([0, 0, 3, 0])
     assert seen_nm(weights(1.0), command, missing, first)[:, 0].tolist() == [-1, 1, 2, 4]
     assert seen_nm(weights(2.0), command, missing, first)[:, 0].tolist() == [-1, -1, 2, 2]
     assert seen_nm(weights(1.5), command, missing, first)[:, 0].tolist() == [-1, 0, 2, 3]
 
 
-def test_repeated_and_older_frames_are_not_exposures() -> None:
+def test_repeated_and_older_frames_are_not_new_exposures() -> None:
     counts = [5, 6, 6, 4, 9, 8]
     sequence = np.array([*map(frame_sequence, counts), frame_sequence(1, 1_800_000_000)], np.uint64)
     repeated, older = 1 << Rejection.REPEATED, 1 << Rejection.OUT_OF_ORDER
@@ -123,7 +123,7 @@ def test_the_delay_is_recovered_from_the_true_mirror_motion(delay: float) -> Non
     assert delay_from_truth(true, command, missing) == pytest.approx(delay, abs=0.05)
 
 
-def test_a_motionless_mirror_gives_no_delay() -> None:
+def test_no_delay_follows_from_commands_that_do_not_change() -> None:
     motionless = np.full((400, 3), 7, np.float32)
     assert delay_from_truth(motionless, motionless, np.zeros(400, np.int64)) is None
 
@@ -150,7 +150,7 @@ def test_times_next_to_a_missing_frame_are_ignored() -> None:
 @pytest.mark.parametrize(
     ("gain", "leak", "frames"), [(0.5, 0.0, 250), ([0.5, 0.001, 0], [0, 0.001, 0], 2500), (0.0, 0.0, 250)]
 )
-def test_settling_takes_five_time_constants_and_at_least_a_second(gain: object, leak: object, frames: int) -> None:
+def test_settling_takes_five_time_constants_and_at_least_250_frames(gain: object, leak: object, frames: int) -> None:
     law = law_of(gain, leak)
     assert settling_frames(law.gain, law.leak, 250.0) == frames
 

@@ -32,8 +32,8 @@ def test_the_noise_of_a_loop_with_one_frame_of_delay_has_a_closed_form() -> None
 
 
 @pytest.mark.parametrize(("delay", "gain", "leak"), [(1.5, 0.5, 0.0), (2.3, 0.2, 0.02), (2.0, 0.3, 0.0)])
-def test_over_all_time_the_noise_is_that_of_the_commands(delay: float, gain: float, leak: float) -> None:
-    """The expected values follow from the noise of one frame; an exposure may see a mean of two commands."""
+def test_the_noise_term_over_all_time_is_the_noise_of_the_commands(delay: float, gain: float, leak: float) -> None:
+    """Over exposures it is the noise that they see; both follow from the loop's response to the noise of one frame."""
     weights, commands, seen = delay_weights(delay), [0.0] * 5, [0.0]
     for frame in range(2000):
         seen.append(float(weights @ commands[: -1 - len(weights) : -1]))
@@ -83,7 +83,7 @@ def test_the_lag_term_of_a_sine_is_its_rejected_power() -> None:
 
 
 @pytest.mark.parametrize("timing", [SAMPLED, Timing.of(1.0, 0.0)])
-def test_the_lag_term_is_recovered_under_noise(timing: Timing) -> None:
+def test_the_lag_term_is_recovered_from_noisy_measurements(timing: Timing) -> None:
     time_s = np.arange(20_000) / RATE_HZ
     waves = 6 * np.sin(2 * np.pi * 31 * time_s)[:, None].repeat(2, axis=1)
     noisy = waves + 4 * np.random.default_rng(3).standard_normal(waves.shape)
@@ -104,14 +104,14 @@ def test_the_lag_term_is_recovered_under_noise(timing: Timing) -> None:
         ([0.0, 0.0], 0.0, 0.0, True),
     ],
 )
-def test_an_undetected_difference_is_an_upper_limit(
+def test_the_total_of_an_undetected_term_is_an_upper_limit(
     variance: list[float], error: object, expected: float, detected: bool
 ) -> None:
     term = Term(np.array(variance), np.array(error) if error else 0.0)
     assert term.total(BOTH) == (pytest.approx(expected), detected)
 
 
-def run(
+def simulate_loop(
     measure: Callable[[np.ndarray, int], np.ndarray], frames: int = 8000
 ) -> tuple[TimeSeries, TimeSeries, TimeSeries]:
     """Error, residual and seen command of a loop with `law_of_two_modes()` and a sensor `measure(residual, frame)`."""
@@ -129,8 +129,10 @@ def run(
 NOISE = np.random.default_rng(4).standard_normal((8000, 2))
 
 
-def test_a_linear_sensor_with_noise_has_no_other_term() -> None:
-    split = measurement_error(law_of_two_modes(), *run(lambda residual, index: residual + NOISE[index]), np.ones(2))
+def test_a_linear_sensor_with_noise_has_no_cross_talk_and_no_nonlinearity() -> None:
+    split = measurement_error(
+        law_of_two_modes(), *simulate_loop(lambda residual, index: residual + NOISE[index]), np.ones(2)
+    )
     for term in (split.crosstalk, split.nonlinearity):
         rms_nm, detected = term.total(BOTH)
         assert not detected
@@ -143,7 +145,7 @@ def test_an_offset_and_linear_mixing_are_cross_talk() -> None:
     def mixed(residual: np.ndarray, index: int) -> np.ndarray:
         return residual + offset + mixture @ residual + 0.2 * NOISE[index]
 
-    error, residual, seen = run(mixed)
+    error, residual, seen = simulate_loop(mixed)
     split = measurement_error(law_of_two_modes(), error, residual, seen, np.full(2, 0.2))
     steady = np.linalg.solve(np.eye(2) + mixture, -offset)  # the loop settles at a measured error of 0
     assert split.crosstalk.total(BOTH)[0] == pytest.approx(np.linalg.norm(steady), rel=0.03)
@@ -155,23 +157,24 @@ def test_a_quadratic_response_is_nonlinearity() -> None:
     def quadratic(residual: np.ndarray, index: int) -> np.ndarray:
         return residual + 0.3 * residual[::-1] ** 2 + 0.2 * NOISE[index]
 
-    error, residual, seen = run(quadratic)
+    error, residual, seen = simulate_loop(quadratic)
     split = measurement_error(law_of_two_modes(), error, residual, seen, np.full(2, 0.2))
-    straight = run(lambda residual, index: residual + 0.2 * NOISE[index])[1].joined()
+    straight = simulate_loop(lambda residual, index: residual + 0.2 * NOISE[index])[1].joined()
     added = residual.joined() - straight
     expected = np.sqrt(np.sum(added.var(axis=0)))
     assert split.nonlinearity.total(BOTH) == (pytest.approx(expected, rel=0.3), True)
 
 
 def test_too_few_frames_give_no_measurement_error() -> None:
-    few = [one_piece(part.joined()[:45]) for part in run(lambda residual, index: residual + NOISE[index], 600)]
+    signals = simulate_loop(lambda residual, index: residual + NOISE[index], 600)
+    few = [one_piece(signal.joined()[:45]) for signal in signals]
     assert measurement_error(law_of_two_modes(), *few, np.ones(2)) is None
     empty = TimeSeries((), 0)
     assert measurement_error(law_of_two_modes(), empty, empty, empty, np.ones(2)) is None
 
 
 def test_the_terms_add_up_to_the_residual_of_a_simulated_loop() -> None:
-    """They agree within 6 % of the total rms and 12 % for tip and tilt; in 1.5 s noise alone scatters by 3 to 5 %."""
+    """The rms agrees within 6 %, that of tip and tilt within 12 %; in 1.5 s noise alone scatters by 3 to 5 %."""
     keys = {"control.start_mode": "closed", "camera.rate_hz": RATE_HZ, "disturbance.scale": 2.0}
     config = load(None, keys | FIXED_GAINS | SMALL_MIRROR)
     calibration = calibrated(config)

@@ -28,16 +28,16 @@ def wheel(**keys: Any) -> tuple[Configuration, Bench]:
     return config, bench
 
 
-def residual_mas(bench: Bench, run: TimeSeries, timing: Timing, *, continuous: bool = True) -> float:
-    """Residual in mas of the law tuned from `run` for a timing: over all time, or only at the starts of exposures."""
-    bench.ask("law", law=tuned(run, bench.config, timing=timing)["lqg"].law)
+def residual_mas(bench: Bench, series: TimeSeries, timing: Timing, *, continuous: bool = True) -> float:
+    """Residual, mas, of the law tuned from `series` for a timing: over all time, or only at starts of exposures."""
+    bench.ask("law", law=tuned(series, bench.config, timing=timing)["lqg"].law)
     bench.new_record()
     bench.run(SETTLE + MEASURE)
     return bench.tilt_mas(MEASURE, continuous=continuous)
 
 
 def residual_between_instants_mas(bench: Bench) -> float:
-    """Residual in mas over all time in the last frames, from the commands of a loop whose camera images an instant."""
+    """Residual, mas, over all time in the last frames, from the commands of a loop whose camera images an instant."""
     sampler = Sampler(disturbance_of(bench.config), (np.arange(8) + 0.5) / 8, bench.config.camera.rate_hz)
     counts = [count_of(step.frame_sequence) for step in bench.steps[-MEASURE:]]
     disturbance_nm = np.array([sampler.at(count) for count in counts[1:]], float)
@@ -60,10 +60,10 @@ def test_the_best_law_nulls_the_mean_over_the_period_of_its_command() -> None:
     """The law of `lowfc tune` leaves less than a law that nulls the mean over the next exposure."""
     _, bench = wheel()
     bench.run(IDENTIFY)
-    run = bench.pol()
+    series = bench.pol()
     assert bench.tilt_mas(IDENTIFY) == pytest.approx(2.97, rel=0.03)
-    assert residual_mas(bench, run, Timing(1.0, 1.0, 0.5, 0.5)) == pytest.approx(0.955, rel=0.03)
-    assert residual_mas(bench, run, Timing.of(1.0, 0.5)) == pytest.approx(0.73, rel=0.03)
+    assert residual_mas(bench, series, Timing(1.0, 1.0, 0.5, 0.5)) == pytest.approx(0.955, rel=0.03)
+    assert residual_mas(bench, series, Timing.of(1.0, 0.5)) == pytest.approx(0.73, rel=0.03)
 
 
 def test_the_integrator_with_two_frames_of_delay_leaves_6_55_mas() -> None:

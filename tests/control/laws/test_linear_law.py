@@ -43,7 +43,7 @@ def test_each_mode_is_clipped_at_its_own_limit() -> None:
         ({"limit_nm": -1.0}, "limit_nm"),
     ],
 )
-def test_a_law_out_of_range_is_refused(change: dict[str, float], message: str) -> None:
+def test_an_integrator_with_a_value_out_of_range_is_refused(change: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         law_of(**change)
 
@@ -51,7 +51,7 @@ def test_a_law_out_of_range_is_refused(change: dict[str, float], message: str) -
 @pytest.mark.parametrize(
     ("delay", "expected"), [(1, [1]), (2, [0, 1]), (3, [0, 0, 1]), (1.25, [0.75, 0.25]), (2.5, [0, 0.5, 0.5])]
 )
-def test_delay_weights_divide_a_frame_between_the_commands_that_it_sees(delay: float, expected: list[float]) -> None:
+def test_delay_weights_divide_an_exposure_among_the_commands_that_it_sees(delay: float, expected: list[float]) -> None:
     assert delay_weights(delay).tolist() == pytest.approx(expected)
 
 
@@ -81,7 +81,7 @@ def pi(gain: Array, proportional: Array, leak: Array) -> LinearLaw:
     return pi_notch(NOLL, gain, proportional, leak, [()] * len(NOLL), 1.0, RATE_HZ)
 
 
-def test_the_integrator_as_a_linear_law_agrees_to_single_precision() -> None:
+def test_the_integrator_and_its_linear_law_give_the_same_commands_to_single_precision() -> None:
     law, rng = linear(PLAIN), np.random.default_rng(1)
     x, command = at_rest(law), np.zeros(3, np.float32)
     for error in rng.standard_normal((100, 3)).astype(np.float32):
@@ -91,7 +91,7 @@ def test_the_integrator_as_a_linear_law_agrees_to_single_precision() -> None:
 
 
 @pytest.mark.parametrize("delay_frames", [1.0, 1.4, 2.0, 3.0])
-def test_an_integrator_of_pseudo_open_loop_modes_equals_one_of_the_error(delay_frames: float) -> None:
+def test_an_integrator_of_pseudo_open_loop_modes_commands_like_an_integrator_of_the_error(delay_frames: float) -> None:
     disturbance = np.random.default_rng(2).standard_normal((300, 3))
     modes = list(zip(GAIN / 2, LEAK, strict=True))
     pol, error = integrators(modes, "pol", delay_frames), integrators(modes, "error", delay_frames)
@@ -113,7 +113,7 @@ def test_a_pi_law_follows_its_difference_equation() -> None:
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_closing_starts_from_the_held_command(name: str) -> None:
+def test_a_law_starts_from_the_held_command_when_the_loop_closes(name: str) -> None:
     """After a long time without errors, the first command is the held one, whatever was measured before."""
     law = LAWS[name]
     held = np.array([30, -20, 10], np.float32)
@@ -232,7 +232,7 @@ def test_the_margins_for_gain_one_half_and_one_frame_of_delay_agree_with_a_hand_
     assert margins_.gain_margin[0] == pytest.approx(4, rel=1e-3)
 
 
-def test_margins_are_those_of_the_true_delay_also_if_the_law_assumes_another() -> None:
+def test_margins_are_computed_for_the_true_delay_also_if_the_law_assumes_another_delay() -> None:
     """A law of pseudo-open-loop modes uses its own delay; the loop has the true delay."""
     law = integrators([(0.6, 0.0)], "pol", 1.0)
     assert margins(law, 1.0).gain_margin[0] == pytest.approx(2 / 0.6, rel=1e-3)
@@ -247,12 +247,12 @@ def test_a_stable_loop_settles(gain: float, true_frames: float, signal: Signal) 
     """A loop that `margins` calls stable settles after a step, also if the true delay is not the law's."""
     law = integrators([(gain, 0.0)], signal, 1.0)
     margins_ = margins(law, true_frames)
-    if abs(margins_.radius[0] - 1) > 0.03:  # nearer to 1, 400 frames do not show whether the loop is stable
+    if abs(margins_.radius[0] - 1) > 0.03:  # otherwise 400 frames do not show whether the loop is stable
         residual = run(law, np.ones((400, 1)), true_frames, limit_nm=1e6)[0][-1, 0]
         assert margins_.stable == (abs(residual) < 0.01)
 
 
-def test_rejection_equals_the_residual_of_a_line() -> None:
+def test_rejection_is_the_ratio_of_the_residual_of_a_sine_to_the_sine() -> None:
     law = LAWS["notch"]
     for frequency_hz in (30.0, 71.0, 150.0):
         line = np.repeat(np.sin(2 * np.pi * frequency_hz * np.arange(8000) / RATE_HZ)[:, None], 3, axis=1)

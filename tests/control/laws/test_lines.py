@@ -1,4 +1,4 @@
-"""LQG for damped lines: comparison with the best law within the margins, and the margins themselves."""
+"""LQG for damped lines: its residual compared with that of the best law within the margins, and its margins."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ from tests.support.theory import one_piece
 from tools import laws
 from tools.law_bench import RATE_HZ, Bench, calibrated, configured, tuned
 
-WIDTHS, DELAYS, FRAMES = (0.001, 0.005, 0.02), (1.0, 2.0), 16_000
+WIDTHS, DELAYS, FRAMES = (0.001, 0.005, 0.02), (1.0, 2.0), 16_000  # widths relative to the lines' frequencies
 
 
 def tilts_of(config: Configuration, noise_nm: Array, frames: int = FRAMES) -> TimeSeries:
@@ -36,7 +36,7 @@ def tilts_of(config: Configuration, noise_nm: Array, frames: int = FRAMES) -> Ti
 
 @pytest.mark.slow
 def test_an_identified_law_is_nearly_optimal() -> None:
-    """The noise level is one at which the margins are no constraint."""
+    """At this noise level the best law keeps the margins anyway."""
     config = configured()
     calibration = calibrated(config)
     law = tuned(tilts_of(config, frame_noise_nm(config, calibration)[:2], 8000), config)["lqg"].law
@@ -47,8 +47,8 @@ def test_an_identified_law_is_nearly_optimal() -> None:
 @pytest.mark.parametrize("delay", DELAYS)
 @pytest.mark.parametrize("magnitude", [0.0, 2.0, 5.0])
 @pytest.mark.parametrize("width", WIDTHS)
-def test_laws_are_nearly_optimal_within_the_margins(width: float, magnitude: float, delay: float) -> None:
-    """Laws are identified without images; `test_modal_simulation_agrees_with_images` compares both."""
+def test_identified_laws_are_nearly_optimal_within_the_margins(width: float, magnitude: float, delay: float) -> None:
+    """Laws are identified from modes, not images; `test_laws_from_modes_agree_with_laws_from_images` compares both."""
     keys = {"star.magnitude": magnitude, "disturbance.line_width": width}
     config = configured(delay_frames=delay, **keys)
     calibration = calibrated(config)
@@ -83,7 +83,7 @@ def test_a_filter_keeps_the_margins_at_any_noise(noise_nm: float, width: float, 
 
 
 @pytest.mark.slow
-def test_modal_simulation_agrees_with_images() -> None:
+def test_laws_from_modes_agree_with_laws_from_images() -> None:
     """Images of the twin and modes without images give the same noise level above the lines and nearly the same laws.
 
     The identified noise is lower than a frame's: the model of a line has wings up to half the rate, while those of the

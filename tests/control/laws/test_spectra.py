@@ -1,4 +1,4 @@
-"""Spectra and measured transfer functions of known signals: noise, sines, gaps, and loops with known theory."""
+"""Spectra of noise, sines and series with gaps; transfer functions measured in loops, against theory."""
 
 from dataclasses import replace
 
@@ -56,7 +56,7 @@ def test_a_sine_keeps_its_power_and_its_frequency() -> None:
     assert power.variance_nm2() == pytest.approx(4.5, rel=0.01)
 
 
-def test_the_standard_error_equals_the_scatter() -> None:
+def test_the_standard_error_of_a_variance_equals_its_scatter_over_trials() -> None:
     rng = np.random.default_rng(2)
     trials = [spectrum(one_piece(rng.standard_normal((2000, 1))), RATE_HZ) for _ in range(300)]
     band = (trials[0].frequency_hz < 50)[:, None]
@@ -65,7 +65,7 @@ def test_the_standard_error_equals_the_scatter() -> None:
     assert np.mean(errors) == pytest.approx(np.std(variances), rel=0.2)
 
 
-def test_short_gaps_are_interpolated_and_long_gaps_split_the_run() -> None:
+def test_short_gaps_are_interpolated_and_long_gaps_split_the_series() -> None:
     values = np.arange(20.0)[:, None] * [1.0, -2.0]
     present = np.ones(20, bool)
     present[5 : 5 + MAX_INTERPOLATED_FRAMES] = False
@@ -91,21 +91,21 @@ def test_a_camera_restart_starts_a_new_piece() -> None:
     assert [len(piece) for piece in time_series(lower_after_a_clear, np.ones((20, 1))).values] == [10, 10]
 
 
-def test_empty_and_short_runs_have_no_spectrum() -> None:
+def test_empty_and_short_series_have_no_spectrum() -> None:
     assert time_series(sequences(0), np.zeros((0, 2))) == TimeSeries((), 0)
     assert time_series(sequences(3), np.full((3, 2), np.nan)) == TimeSeries((), 0)
     noise = np.random.default_rng(1).standard_normal((SHORTEST, 1))
-    runs = TimeSeries((), 0), one_piece(noise[1:]), one_piece(noise)
-    assert [spectrum(run, RATE_HZ) is not None for run in runs] == [False, False, True]
+    all_series = TimeSeries((), 0), one_piece(noise[1:]), one_piece(noise)
+    assert [spectrum(series, RATE_HZ) is not None for series in all_series] == [False, False, True]
 
 
-def test_a_longer_run_has_a_finer_spectrum() -> None:
+def test_a_longer_series_has_a_finer_spectrum() -> None:
     rng = np.random.default_rng(3)
     spacings = [spectrum(one_piece(rng.standard_normal((n, 1))), RATE_HZ).spacing_hz for n in (100, 1000, 100_000)]
     assert spacings == [RATE_HZ / SHORTEST, RATE_HZ / 128, RATE_HZ / LONGEST]
 
 
-def test_bins_are_logarithmic_and_preserve_a_straight_line() -> None:
+def test_bins_are_even_in_the_logarithm_and_preserve_a_straight_line() -> None:
     frequency_hz = np.linspace(0, 250, 1025)
     centres_hz, (same,) = in_bins(frequency_hz, [frequency_hz])
     assert centres_hz[0] == frequency_hz[1]
@@ -205,7 +205,7 @@ def test_an_impossible_multisine_is_refused(arguments: tuple[int, int, int, floa
         lines(*arguments)
 
 
-def test_a_multisine_has_the_requested_rms_and_lines_and_a_low_crest() -> None:
+def test_a_multisine_has_the_requested_rms_and_lines_and_a_low_crest_factor() -> None:
     places = lines(4000, 4, 15, 0.001, 0.3)
     table = multisine(4000, places, 2.0, 5)
     assert np.std(table, axis=0) == pytest.approx(2.0, rel=1e-5)
@@ -219,7 +219,7 @@ def test_a_multisine_has_the_requested_rms_and_lines_and_a_low_crest() -> None:
     assert np.array_equal(with_lead[4500:], table)
 
 
-def test_a_vibration_near_a_line_raises_its_error() -> None:
+def test_a_vibration_near_a_line_raises_the_standard_error_of_the_line() -> None:
     rng = np.random.default_rng(2)
     period = multisine(PERIOD, lines(PERIOD, 1, 10, 0.005, 0.3), 2.0, 1).astype(float)
     place = int(lines(PERIOD, 1, 10, 0.005, 0.3)[0][4])
@@ -250,7 +250,7 @@ def test_a_staircase_limits_its_steps_and_holds_its_levels() -> None:
         assert start == 0 or level == previous or stairs[start - 1] != level, "a start is the first frame at its level"
 
 
-def test_known_gain_and_crosstalk_are_recovered() -> None:
+def test_the_gain_and_cross_talk_of_a_known_sensor_are_recovered() -> None:
     rng = np.random.default_rng(8)
     levels_nm = levels([4.0, 8.0, 16.0], 8)
     stairs, starts = build_staircase(levels_nm, 8, 10.0)

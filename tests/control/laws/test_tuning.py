@@ -22,7 +22,7 @@ NO_LEAK = np.zeros(2)
 
 
 def wheel(frames: int) -> tuple[TimeSeries, np.ndarray]:
-    """Pseudo-open-loop tilts of the reaction wheel, and the true tilts."""
+    """Pseudo-open-loop tilts of the reaction wheel, and the true tilts (frames, 2), nm."""
     truth = modes_nm(preset_disturbance("reaction-wheel", NOLL, 1, NM_PER_MAS, 550.0), 0, frames, RATE_HZ)
     noise = 0.8 * np.random.default_rng(1).standard_normal(truth.shape)
     return one_piece(truth + noise), truth
@@ -38,7 +38,7 @@ def test_the_highest_gain_has_exactly_the_least_allowed_margins(delay_frames: fl
 
 
 def test_the_best_gain_agrees_with_theory() -> None:
-    """A random walk with noise: the minimum of drift |S|^2 + noise |T|^2 over the gains, by a search."""
+    """For a random walk with noise, theory gives drift |S|^2 + noise |T|^2, whose minimum over gains is searched."""
     model = Model(0.02, np.inf, (), 1.0, RATE_HZ)
     pol = one_piece(np.hstack([realised(model, 40_000, seed) for seed in (1, 2)]))
     best = best_gains(pol, RATE_HZ, Timing.sampled(1.0), NO_LEAK)
@@ -96,7 +96,7 @@ def test_laws_on_the_reaction_wheel_leave_the_predicted_residual(
     assert all(residual_mas[name] < most for name, most in at_most_mas.items())
 
 
-def test_white_noise_gets_a_law_with_a_small_residual() -> None:
+def test_a_law_tuned_on_white_noise_leaves_a_small_residual() -> None:
     """White noise cannot be predicted: any choice between LQG and integrator leaves a small residual."""
     noise = np.random.default_rng(5).standard_normal((4096, 2))
     pol = one_piece(noise)
@@ -107,7 +107,7 @@ def test_white_noise_gets_a_law_with_a_small_residual() -> None:
     assert best.law.signal == "pol"
 
 
-def test_too_few_frames_are_refused() -> None:
+def test_a_log_with_too_few_frames_in_a_row_is_refused() -> None:
     pol = one_piece(np.zeros((500, 2)))
     with pytest.raises(ValueError, match="at least 2048 consecutive frames, the longest piece has 500"):
         best_gains(pol, RATE_HZ, Timing.sampled(1.0), NO_LEAK)
@@ -117,8 +117,8 @@ def test_too_few_frames_are_refused() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("delay", [1.0, 2.0])
-def test_lqg_agrees_with_theory_and_adapts_to_shifted_lines(delay: float) -> None:
-    """It leaves at most 15 % more than theory and the best LQG law. For shifted lines, a new law is as good to 15 %."""
+def test_a_law_tuned_in_a_loop_is_nearly_optimal_also_after_lines_have_moved(delay: float) -> None:
+    """It leaves at most 15 % more than in theory and than the best LQG law; a new law for moved lines, 15 % more."""
     config = configured(delay_frames=delay)
     calibration = calibrated(config)
     bench = Bench(config, calibration)

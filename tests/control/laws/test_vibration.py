@@ -73,7 +73,7 @@ def test_the_spectrum_of_a_model_agrees_with_its_states() -> None:
     np.testing.assert_allclose(model.spectrum_nm2(omega), spectrum_nm2, rtol=1e-6)
 
 
-def test_pieces_are_identified_like_one_run_and_short_ones_are_not() -> None:
+def test_lines_are_identified_in_two_pieces_and_not_in_a_piece_that_is_too_short() -> None:
     whole = ideal_wheel().values[0]
     model = identify(TimeSeries((whole[:6000], whole[6000:]), 0), RATE_HZ)
     assert [round(line.frequency_hz) for line in model.lines] == [6, 18, 37, 71, 117]
@@ -138,7 +138,7 @@ def minimum_variance_nm2(spectrum_nm2: Array, noise_nm2: float, whole_frames: in
 
 @pytest.mark.parametrize("delay", [1, 2, 3])
 def test_three_predictions_of_the_residual_agree(delay: int) -> None:
-    """Riccati's covariance, the law's own transfer functions, and the factor of the spectrum."""
+    """They follow from Riccati's covariance, the law's transfer functions, and the factor of the spectrum."""
     (A, Q, C), covariance, timing = MODEL.states(), covariance_nm2(MODEL), Timing.sampled(delay)
     for _ in range(delay - 1):  # further frames without a measurement
         covariance = A @ covariance @ A.T + Q
@@ -164,7 +164,7 @@ def test_a_loop_leaves_the_predicted_residual(noisy_nm: Array, delay_frames: flo
     assert np.sqrt(residual_nm2) == pytest.approx(predicted_nm(law, [MODEL], Timing.sampled(delay_frames))[0], rel=0.1)
 
 
-def test_a_constant_is_rejected() -> None:
+def test_a_constant_disturbance_is_rejected() -> None:
     law = lqg([replace(MODEL, drift_nm2=1e-6)], (2,), SAMPLED)
     assert rejection(law, np.array([1e-4]), 1.0)[0, 0] < 0.01
 
@@ -172,7 +172,7 @@ def test_a_constant_is_rejected() -> None:
 @pytest.mark.parametrize("noise_nm2", [1e-4, 0.7, 100.0])
 @pytest.mark.parametrize("width_hz", [1e-9, 1e-6, 1e-2, 3.0])
 def test_the_covariance_solves_the_riccati_equation(width_hz: float, noise_nm2: float) -> None:
-    """It does so with poles at any distance from the unit circle."""
+    """It does so for poles close to the unit circle (narrow lines) and far from it."""
     lines = tuple(Line(frequency, width_hz, 1e-3 * frequency) for frequency in (0.3, 6, 6.5, 18, 117))
     model = Model(1e-8, 0.2, lines, noise_nm2, RATE_HZ)
     A, Q, C = model.states()
@@ -183,6 +183,6 @@ def test_the_covariance_solves_the_riccati_equation(width_hz: float, noise_nm2: 
     assert np.abs(np.linalg.eigvals(A - np.outer(gain, C @ A))).max() < 1
 
 
-def test_models_of_two_rates_are_refused() -> None:
+def test_a_law_from_models_with_two_frame_rates_is_refused() -> None:
     with pytest.raises(ValueError, match=r"one frame rate, got \[500.0, 1000.0\]"):
         lqg([MODEL, replace(MODEL, rate_hz=500.0)], (2, 3), SAMPLED)

@@ -1,4 +1,4 @@
-"""Virtual integrators against real loops with their gains."""
+"""Virtual integrators, compared with real loops that have their gains."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from lowfc.control.laws.integrator import Integrator, integrate
 from lowfc.control.laws.virtual import VirtualIntegrators
 
 
-def test_each_row_equals_a_loop_with_its_gain() -> None:
+def test_each_row_has_the_errors_and_commands_of_a_loop_with_its_gain() -> None:
     rng = np.random.default_rng(1)
     half = np.float32(0.5)  # weight of each of two commands: a delay of 1.5 frames
     gain = np.array([[0, 0], [0.1, 0.4], [0.3, 0.2]], np.float32)
@@ -28,8 +28,8 @@ def test_each_row_equals_a_loop_with_its_gain() -> None:
         np.testing.assert_allclose(rows.history_nm[0], [newest for newest, _ in commands], atol=1e-4)
 
 
-def test_differences_of_squared_errors_equal_those_of_true_residuals() -> None:
-    """They do so over 20,000 frames of a slow drift with several times stronger noise."""
+def test_differences_of_squared_errors_equal_differences_of_squared_true_residuals() -> None:
+    """They do so on average over 20,000 frames of a slow drift with stronger noise."""
     rng = np.random.default_rng(2)
     gain = np.array([0, 0.02, 0.5], np.float32)[:, None] * np.ones((1, 40), np.float32)
     ones = np.ones(40, np.float32)
