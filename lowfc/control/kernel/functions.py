@@ -15,9 +15,8 @@ def scan(
 ) -> tuple[np.uint64, np.uint16]:
     """Products of one block of a frame with R, in one pass over its counts.
 
-    `counts`, `used` and `dark` are this block's part of `pixels`, `good` and `dark` in `measure`; `row` is the index of
-    the block's first row in `tiles`. The products, not yet normalised, are written to `sums_nm` (modes rounded up to
-    five,).
+    `counts`, `used` and `dark` are this block's part of `pixels`, `good` and `dark` in `measure`; `row` is the index in
+    `tiles` of the block's first row. The products, not yet normalised, are in `sums_nm` (modes rounded up to five,).
 
     Returns:
         Sum of the used counts, and the highest used count.

@@ -157,7 +157,7 @@ def delay_from_times(
 
 
 def frames_since(begins: Mask, running: Mask, missing: Integers) -> Integers:
-    """Frames (steps,) since the loop started to run, or since the last step where `begins`; -1 while not running."""
+    """Number of frames (steps,) since the loop started to run, or since a step where `begins`; -1 while not running."""
     place = np.arange(len(running)) + np.cumsum(missing)
     started = running & (begins | ~np.concatenate([[False], running[:-1]]))
     return np.where(running, place - np.maximum.accumulate(np.where(started, place, 0)), -1)
