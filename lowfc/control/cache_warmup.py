@@ -7,14 +7,14 @@ MIN_LEAD_NS = 80_000
 MIN_PERIOD_NS = 500_000
 """Longest frame period without warm-ups: there is no time for one, and no need, since the caches stay warm."""
 LATENESS_DIVISOR = 50
-"""A frame late by at most `LEAD_NS` moves the schedule by its lateness divided by this."""
+"""A frame that is late by at most `LEAD_NS` moves the schedule by its lateness divided by this number."""
 
 
 class CacheWarmup:
     """Predicts the next frame and schedules one warm-up before it.
 
-    A frame that is early, or late by more than `LEAD_NS`, resets the schedule. A less late one moves it only a little,
-    because the host is sometimes late and the camera is not.
+    A frame that is early, or late by more than `LEAD_NS`, resets the schedule. A less late frame moves the schedule
+    only a little, because the host is sometimes late and the camera is not.
     """
 
     def __init__(self, period_ns: int) -> None:
@@ -37,7 +37,7 @@ class CacheWarmup:
         return max(self._due_ns - LEAD_NS - now_ns, 0) if self._pending else None
 
     def due(self, now_ns: int) -> bool:
-        """Whether to warm up now; true at most once per frame, and false if it is too late."""
+        """Whether to warm up now; true at most once per frame, and false if a warm-up would be too late."""
         if not self._pending or now_ns < self._due_ns - LEAD_NS:
             return False
         self._pending = False

@@ -1,7 +1,7 @@
 """Detect pokes in the images, and measure the delay from poke to image in frames.
 
 The response to a pseudo-random poke is one image, which appears at each lag with its own weight. The image is estimated
-from one half of the frames and detected in the other, so that its noise does not correlate with itself. The weights
+from one half of the frames and detected in the other half, whose noise does not correlate with it. The weights
 follow the loop's model of a delay, in which two neighbouring lags share the whole response.
 """
 
@@ -12,7 +12,7 @@ import numpy as np
 from lowfc.arrays import Array
 
 LAGS = 6
-"""Number of frames in which a poke is searched for, from its own frame on."""
+"""Number of frames in which a poke is searched for, from the frame of the poke on."""
 MIN_FRAMES = 40 * LAGS  # fewest consecutive frames from which a delay is measured
 MIN_SNR = 10.0
 """Least signal-to-noise ratio of a detected poke; noise alone exceeds it with a probability below 1e-13."""

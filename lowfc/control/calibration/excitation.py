@@ -46,7 +46,7 @@ def lines(period_frames: int, modes: int, lines_per_mode: int, lowest: float, hi
     places = (np.geomspace(first, last, count).astype(np.intp) - 1) | 1
     places[0] = first
     ahead = np.arange(count) * step
-    places = np.maximum.accumulate(places - ahead) + ahead  # each at least a step above the one before
+    places = np.maximum.accumulate(places - ahead) + ahead  # each at least a step above the place before it
     if places[-1] > last:
         room = int((last - first) // step) + 1
         raise ValueError(

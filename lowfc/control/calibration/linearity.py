@@ -10,7 +10,7 @@ from lowfc.arrays import Array, Integers
 SIGMAS = 3.0
 """Standard errors by which a value must exceed a limit to count as beyond it."""
 MAX_RESIDUAL = 0.3
-"""Largest residual of a captured shape, in any mode, as a fraction of its amplitude."""
+"""Largest residual of a captured shape, in any mode, as a fraction of the amplitude of the shape."""
 
 _SIGNS = np.array([1.0, -1.0, -1.0, 1.0])  # signs of one cycle, over which a linear drift cancels
 

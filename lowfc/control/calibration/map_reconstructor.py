@@ -1,4 +1,4 @@
-"""Maximum-a-posteriori (MAP) reconstructor of the corrected modes, with a prior for the uncorrected ones."""
+"""Maximum-a-posteriori (MAP) reconstructor of the corrected modes, with a prior for the uncorrected modes."""
 
 from functools import lru_cache
 
@@ -36,8 +36,8 @@ def map_rows(
 ) -> list[Single]:
     """Matrices M (modes, columns), such as R, with the rows M_c - C_cu (C_uu + P_u)^-1 M_u for corrected modes c.
 
-    M_u are the rows of the uncorrected modes u, which stay as they are, P_u is their prior, and C the noise covariance
-    of the calibration's own R. If this R is the weighted one for the same flux, the new rows of R are
+    M_u are the rows of the uncorrected modes u; they stay as they are. P_u is the prior of these modes, and C the noise
+    covariance of the calibration's own R. If this R is the weighted one for the same flux, the new rows of R are
     (H'WH + P^-1)^-1 H'W.
 
     Args:

@@ -108,7 +108,7 @@ def advice(reconstruction: Reconstruction, noll: tuple[int, ...], limit_nm: Sing
         reconstruction: R and its singular values, by the weighted estimator.
         noll: Noll index of each mode.
         limit_nm: (modes,) largest command; the loop cannot follow a combination with more noise in a frame than the
-            limit of the mode that has the largest part in it.
+            limit of the mode with the largest part in the combination.
     """
     noise_nm, kept = 1 / np.maximum(reconstruction.singular_values, 1e-300), reconstruction.kept
     suppressed, least = int(np.count_nonzero(kept < 0.5)), float(kept.min())

@@ -28,7 +28,7 @@ _WORST_INSTRUMENT = 1e6
 _OUTLIER = 4.0
 """Standard deviations from the median to which outlying cycles are clipped."""
 _MEDIAN_NOISE = 1.2
-"""Ratio of the noise of the median of a few values to that of their mean."""
+"""Ratio of the noise of the median of a few values to the noise of their mean."""
 _BETTER = 0.95
 """A later candidate is chosen if its noise is below this fraction of an earlier one's."""
 _MEAN_SQUARE_ERRORS = 3.0
@@ -126,7 +126,7 @@ class Measured(NamedTuple):
 
 
 def normalised(frames: npt.NDArray[np.number], dark: Array, good: Array) -> tuple[Array, Array]:
-    """Frames (frames, pixels) minus the dark, each divided by its flux, and the fluxes (frames,) in DN.
+    """Frames (frames, pixels) minus the dark, each frame divided by its flux, and the fluxes (frames,) in DN.
 
     Raises:
         ValueError: a frame has no light.
@@ -247,7 +247,7 @@ def cross_talk(reconstructor: npt.NDArray[np.floating], response: npt.NDArray[np
 
 
 def correlation(response: npt.NDArray[np.floating], other: npt.NDArray[np.floating]) -> float:
-    """Correlation of the responses (pixels,), any unit, to two pokes: negative if their signs are opposite."""
+    """Correlation of the responses (pixels,), any unit, to two pokes; negative if the responses have opposite signs."""
     norms = float(np.linalg.norm(response) * np.linalg.norm(other))
     return float(response @ other) / max(norms, 1e-300)
 

@@ -69,8 +69,8 @@ class Verdict(NamedTuple):
 class GainBank:
     """Virtual integrators of a group of modes, compared over windows of frames.
 
-    The first window after `restart` may choose any gain; later ones move a gain by at most a factor of two, unless the
-    open loop is better than the current gain, or the current gain is 0 or the least one.
+    The first window after `restart` may choose any gain. Later windows move a gain by at most a factor of two, unless
+    the open loop is better than the current gain, or the current gain is 0 or the least gain.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class GainBank:
             limit_nm: (modes,) largest command.
             weights: Which commands an exposure sees.
             delay_frames: The loop's delay.
-            windows: Frames of the first window, and of each later one before it grows.
+            windows: Frames of the first window, and of each later window before it grows.
         """
         highest = np.array([highest_gain(delay_frames, mode_leak) for mode_leak in leak.tolist()])
         rows = highest.max() * 0.5 ** np.arange(int(np.log2(highest.max() / MIN_GAIN)), -1.0, -1)
@@ -158,7 +158,7 @@ class GainBank:
     def early(self, gain: Single) -> Single:
         """Gains (modes,) to use before the window is complete, from the gains in use.
 
-        A mode with a gain of 0 or the least gain gets a better one if there is one (see `EARLY_BLOCKS`). A mode whose
+        A mode with a gain of 0 or the least gain gets a better gain if there is one (see `EARLY_BLOCKS`). A mode whose
         signal proves to be cross-talk gets 0. All others keep their gains.
         """
         if self.first or len(self._excesses) < EARLY_BLOCKS:
@@ -344,7 +344,7 @@ class TiltCrossTalk:
         """Add consecutive frames: tip and tilt (frames, 2) as the sensor saw them, the others (frames, modes), nm.
 
         Returns:
-            (regressors,) sums over the frames; `mean_nm` takes their means.
+            (regressors,) sums over the frames; `mean_nm` needs their means.
         """
         x, y = tilt_nm.T.astype(float)
         rows = np.column_stack([x, y, x * x, x * y, y * y, open_nm])

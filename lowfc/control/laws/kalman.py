@@ -1,4 +1,4 @@
-"""LQG: a Kalman filter of a mode's drift and lines, and the command that removes its prediction.
+"""LQG: a Kalman filter of a mode's drift and lines, and the command that removes the predicted disturbance.
 
 The filter's input is pseudo-open-loop modes, so its steady gain does not depend on the command. The command nulls the
 mean prediction over the period in which it is in force: not at an instant, and not over the next exposure.

@@ -1,8 +1,8 @@
 """Closed-loop poles, margins, rejection and noise transfer of a linear law, for any true delay.
 
 A frame measures error = disturbance + noise + B command with B(z) = sum_j w_j z^-(1+j), w from the true delay; the law
-replies with command = -C error. Then L = C B, S = 1 / (1 + L) and T = L S. Coupled modes are evaluated one by one with
-the others closed: L of a mode is 1/S - 1.
+replies with command = -C error. Then L = C B, S = 1 / (1 + L) and T = L S. Coupled modes are evaluated one by one, with
+the loops of the others closed: L of a mode is 1/S - 1.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ _GRID = 2048  # frequencies of each regular grid
 _AROUND_POLE = np.concatenate([-np.geomspace(1e-2, 1e2, 33)[::-1], [0.0], np.geomspace(1e-2, 1e2, 33)])
 """Frequencies relative to a pole's, in units of the pole's distance from the unit circle."""
 _LOWEST = 1e-6  # rad per frame: an integrator has no value at 0 Hz
-_ROUNDING = 1e-6  # poles other than those of a driven closed loop may exceed 1 by this, from single precision
+_ROUNDING = 1e-6  # excess above 1 that single precision may cause in poles, except in a driven closed loop
 
 
 @dataclass(frozen=True, slots=True)

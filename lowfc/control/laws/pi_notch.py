@@ -10,7 +10,7 @@ from lowfc.arrays import Array
 from lowfc.control.laws.linear_law import Block, LinearLaw, law_from_blocks
 from lowfc.control.laws.stability import delay_weights
 
-_EXACT = 1e-6  # noise variance of the limited commands in `_correction`; the Riccati equation needs one above 0
+_EXACT = 1e-6  # noise variance of the limited commands in `_correction`; the Riccati equation needs a value above 0
 _UNKNOWN = 1e-3
 """Variance of unknown changes of the states in `_correction`: with a larger value, the return from a limit takes
 longer; with a smaller one, wrong states last longer."""
@@ -37,7 +37,7 @@ def pi_notch(
     delay_frames: float,
     rate_hz: float,
 ) -> LinearLaw:
-    """A PI law with a resonator for each notch, whose phase compensates the delay at its frequency.
+    """A PI law with a resonator for each notch; the phase of a resonator compensates the delay at its frequency.
 
     Without notches c[k] = (1 - leak) (c[k-1] + proportional e[k-1]) - (gain + proportional) e[k]. Its states follow the
     command after limits, so that limits cause no wind-up and closing starts from the held command. Check its stability

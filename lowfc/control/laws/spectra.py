@@ -11,7 +11,7 @@ from lowfc.arrays import Array, Integers, Sequences
 from lowfc.control.loop.inputs import COUNT_BITS
 
 MAX_INTERPOLATED_FRAMES = 3
-"""Longest gap, in frames, that is interpolated; a longer one starts a new piece."""
+"""Longest gap, in frames, that is interpolated; a longer gap starts a new piece."""
 SHORTEST, LONGEST = 64, 2048
 """Shortest and longest segment of Welch's method, frames; with fewer than the shortest there is no spectrum."""
 _SEGMENT_SHARE = 4  # the longest piece is at least this many segments long, unless a segment would be below `SHORTEST`
@@ -153,7 +153,7 @@ def in_bins(frequency_hz: Array, columns: Sequence[Array]) -> tuple[Array, list[
 
 
 def interpolated(position: Integers, rows: Array, frames: int) -> Array:
-    """Rows (frames, columns) at all positions: the given ones at `position`, and interpolated ones between them."""
+    """Rows (frames, columns) at all positions: `rows` at `position`, and interpolated rows between these."""
     if frames == position.size:
         return rows
     return np.stack([np.interp(np.arange(frames), position, column) for column in rows.T], axis=1)

@@ -1,4 +1,4 @@
-"""Highest gains of the integrator: those at which its loop oscillates, or has exactly the least allowed margins.
+"""Highest gains of the integrator: at which its loop starts to oscillate, and at which it has the least margins.
 
 The loop of `lowfc.control.laws.integrator`: command[k] = (1 - leak) command[k-1] - gain error[k], and
 error[k] = disturbance[k] + sum_j w_j command[k-1-j] + noise[k], with w from the delay in frames.
@@ -17,7 +17,7 @@ LOWEST_GAIN = 0.01
 SETTLING = 5.0
 """Time constants of the slowest mode after which a loop counts as settled."""
 
-_LONGEST_DELAY = 1000  # frames; a longer one, from a damaged file or message, could exceed the memory
+_LONGEST_DELAY = 1000  # frames; a longer delay, from a damaged file or message, could exceed the memory
 _BISECTIONS = 50
 """Halvings of a 4096th of pi, down to double precision; scipy.optimize is not used, as its import takes 0.3 s."""
 
@@ -32,7 +32,8 @@ def delay_weights(delay_frames: float) -> Array:
     """Return w: the fraction of command[k-1-j], j = 0, 1, ..., seen in exposure k; sums to 1.
 
     A delay of d frames (d >= 1) is counted from the frame that a command is computed from to the first frame exposed
-    wholly under it. If d has a fraction f, an exposure sees (1 - f) of the newer and f of the older command.
+    wholly under it. If d has a fraction f, an exposure sees the older command for this fraction of its time, and the
+    newer command for the rest.
 
     Raises:
         ValueError: the delay is below 1 or above 1000 frames, or not a number.

@@ -11,7 +11,7 @@ import numpy as np
 
 from lowfc.arrays import Array, Complex, Integers, Mask
 
-_FAINTEST = 1e-3  # amplitude of a line, relative to the mode's highest; fainter ones are rounding to single precision
+_FAINTEST = 1e-3  # amplitude of a line, relative to the mode's highest; fainter lines are rounding errors
 _ADJACENT = np.array([*range(-16, -1), *range(2, 17)])  # bins, relative to a line's, from which its noise is measured
 _BIN_TO_FLANK = 12 / 7  # ratio of white noise powers under Hann's window: of a bin to that of `flanks`
 _DB = 20 / np.log(10)
@@ -49,8 +49,8 @@ class Departure:
     Attributes:
         db: (lines,) ratio of the measured size to theory, dB.
         error_db: (lines,) standard error of `db`.
-        judged: (lines,) whether its error is small enough for the tolerance.
-        within: (lines,) whether it was judged and is within the tolerance.
+        judged: (lines,) whether the standard error is small enough for the tolerance.
+        within: (lines,) whether the line was judged and its departure is within the tolerance.
     """
 
     db: Array
@@ -62,9 +62,9 @@ class Departure:
 def measure_lines(error_nm: Array, added_nm: Array) -> Lines:
     """S at the lines of the signal added to the loop's input.
 
-    Hann's window keeps high frequencies, which the loop does not reject, out of the low ones, where the error is small;
-    lines are at least two bins apart, so it does not mix them. The noise of a line is measured in the adjacent bins and
-    includes cross-talk from other modes' lines.
+    Hann's window keeps high frequencies, which the loop does not reject, out of low frequencies, where the error is
+    small. It does not mix lines, as they are at least two bins apart. The noise of a line is measured in the adjacent
+    bins and includes cross-talk from other modes' lines.
 
     Args:
         error_nm: (frames, modes) errors in one period.

@@ -37,7 +37,7 @@ class Tuned:
 
     Attributes:
         law: the law, ready to load.
-        margins: margins of the law at the delay that it was made for.
+        margins: margins of the law at the delay for which it was made.
         predicted_nm: (modes,) rms of the true residual.
         kinds: law of each mode: integrator, pi-notch or lqg.
         models: model of each mode.
@@ -269,7 +269,7 @@ def _scaled(model: Model, factor: float, finest_hz: float) -> Model:
 
 
 def within_margins(model: Model, timing: Timing) -> Block | None:
-    """Filter of a model, with its noise overestimated until the margins suffice; None if they cannot be reached.
+    """Filter of a model, with its noise overestimated until the margins suffice; None if they cannot suffice.
 
     A filter with less weight on its measurements predicts more smoothly; the residual of a mode with a modelled line
     hardly increases.

@@ -24,11 +24,11 @@ _SCALES = (3, 9, 27, 81)  # numbers of frequencies over which lines are searched
 _PENALTY = 2.5  # of a line, times log(frequencies): 1.5 for 3 parameters (BIC), 1 for the choice of a frequency
 _SHARE = 0.3  # a narrower line is preferred if it reaches this part of the largest gain in likelihood
 _HANN = 1.5  # under Hann's window neighbouring frequencies are correlated: three count as two
-_LOBE = 12  # frequencies on either side of a line into which the window spreads it
+_LOBE = 12  # frequencies on either side of a line into which the window spreads the line
 _FULL = 40  # frequencies on either side of a line, and from 0 on, that are not averaged
 _PER_DECADE = 48  # groups of averaged frequencies
 _MIN_DRIFT = 1e-8  # ratio of variances of the drift's step and the noise: a constant is followed in 10^4 frames
-_MIN_NOISE = 1e-3  # least ratio of noise to the level at high frequencies: drift may explain it, but filters need noise
+_MIN_NOISE = 1e-3  # least ratio of noise to the level at high frequencies: a filter needs some noise
 
 
 @dataclass(frozen=True, slots=True)

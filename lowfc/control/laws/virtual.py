@@ -11,7 +11,7 @@ Weights = tuple[tuple[int, np.float32], ...]
 
 
 class VirtualIntegrators(NamedTuple):
-    """Integrators in parallel with the real loop, one for each row, which move no mirror.
+    """Integrators in parallel with the real loop, one for each row; they move no mirror.
 
     A frame's noise is independent of the earlier commands. The difference of two rows' squared errors therefore has the
     same mean as the difference of their squared true residuals, for any noise.

@@ -28,7 +28,7 @@ _NOT_NEW = sum(1 << reason for reason in NOT_NEW)
 
 
 def controller_of(law: LinearLaw, limit_nm: Single | None = None) -> Controller:
-    """A linear law as a controller, at first at rest with a flat mirror; `limit_nm` (modes,) clips its commands."""
+    """A linear law as a controller that starts at rest with a flat mirror; `limit_nm` (modes,) clips its commands."""
 
     def step(before: tuple[Single, Single] | None, error_nm: Single, pol_nm: Single) -> tuple[Any, Single]:
         x, held_nm = before or (at_rest(law), np.zeros_like(error_nm))

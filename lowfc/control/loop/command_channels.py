@@ -29,7 +29,7 @@ MAX_NAME_LENGTH = 32  # characters
 
 
 class Channel(NamedTuple):
-    """A shape added to the command, (rows, columns), nm of surface, and the part of it reached so far.
+    """A shape added to the command, (rows, columns), nm of surface, and the part of the shape reached so far.
 
     Once the command has reached the shape, `reached_nm` is the same array as `shape_nm`; `of` ensures this.
     """
@@ -151,7 +151,7 @@ class CommandChannels(NamedTuple):
         return self._replace(play=play).with_all(tuple(_nearer(channel, step) for channel in self.channels), to_modes)
 
     def with_all(self, channels: tuple[Channel, ...], to_modes: Single) -> "CommandChannels":
-        """A copy with these channels instead of its own, without those that have reached flat."""
+        """A copy with these channels instead of its own; channels that have reached flat are left out."""
         kept = tuple(channel for channel in channels if channel.shape_nm.any() or channel.reached_nm.any())
         commanded = [channel for channel in kept if channel.commanded]
         zero = np.zeros_like(self.sum_nm)
@@ -234,7 +234,7 @@ def play_table(target: str, rows: Single, basis: Single) -> PlayTable:
     """Make a table to play, checked as far as possible without the loop; shapes as in `PlayTable`, nm.
 
     Raises:
-        ValueError: the target is unknown, the parts do not match, they are too large, or a number is not finite.
+        ValueError: the target is unknown, table and shapes do not match or are too large, or a number is not finite.
     """
     if target not in (MIRROR, OFFSET):
         raise ValueError(f"the target of a probe sequence is {MIRROR} or {OFFSET}, got {target!r}")

@@ -1,4 +1,4 @@
-"""The guard of a linear law: an integrator on the same frames, which takes over if the law does worse.
+"""The guard of a linear law: an integrator on the same frames takes over if the law has larger errors.
 
 Tip and tilt are judged apart from the other modes, as the larger group would hide the smaller. While the law drives a
 group, the integrator is virtual there (its commands and errors are only computed), and vice versa.
@@ -120,8 +120,8 @@ class LawGuard(NamedTuple):
         frames: number of frames in the current block so far.
         sums_nm2: (3, groups) sums of squares: errors, virtual errors, pseudo-open-loop modes.
         void: whether the virtual loop was interrupted during the block.
-        virtual_nm: virtual commands (modes,), newest first: for each mode, of the controller that does not drive it;
-            empty until the virtual loop starts from the loop's commands.
+        virtual_nm: virtual commands (modes,), newest first, of the controller that does not drive the mode; empty until
+            the virtual loop starts from the loop's commands.
         x: state (states,) of a virtual law that drives the overruled modes too; None while no mode is overruled.
     """
 
@@ -205,7 +205,7 @@ class LawGuard(NamedTuple):
 
         Args:
             law: the guarded law.
-            x: (states,) its state after this frame, in the real loop.
+            x: (states,) state of the law after this frame, in the real loop.
             integrator: the integrator with which the law is compared.
             weights: lag and weight of each command that an exposure sees.
             history_nm: the loop's commands (modes,) before this frame's, newest first.

@@ -44,15 +44,15 @@ class Request:
         modes: Noll indices that the values are for; empty for all.
         values: one for all modes, or one for each; number of frames of a step; or duration of a lease or permit, s.
         text: name of a channel, target of a probe sequence, holder of a lease, or a note; `AUTO` for automatic gains.
-        actuators_nm: one or more shapes of the mirror, one after the other, nm of surface.
+        actuators_nm: one or more shapes of the mirror, concatenated, nm of surface.
         table: (frames, columns) of a probe sequence.
         law: the law to drive the mirror; None for the integrator.
         calibration: the calibration to use.
         played: the checked table and shapes of a probe sequence.
         refusal: reason to refuse the request in any state of the loop.
         prepared: whether the checks that need no state are done; see `lowfc.control.loop.requests.prepared`.
-        lease_id: identity of the sender's lease, or of the requested one; 0 for none.
-        requester: user and program that sent it, for people.
+        lease_id: identity of the sender's lease, or of the requested lease; 0 for none.
+        requester: user and program that sent the request, for people.
         prior_nm2: mean squares (modes,) of the uncorrected modes, nm^2, by which automatic gains weight R.
         flux_dn: the flux at which `prior_nm2` was measured, DN.
     """
@@ -175,7 +175,7 @@ class PendingEvent(NamedTuple):
 
 
 class Reply(NamedTuple):
-    """The answer to a request, with the first frame for which it is in force."""
+    """The answer to a request, and the first frame for which the request is in force."""
 
     accepted: bool
     text: str

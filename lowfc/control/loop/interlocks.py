@@ -98,7 +98,7 @@ class BenchReport:
 def judged(interlocks: tuple[Interlock, ...], acting: tuple[Acting, ...], report: BenchReport) -> tuple[Acting, ...]:
     """The interlocks that act after a report; the same object if nothing changed.
 
-    An interlock that acts already keeps its cause, unless a value replaces a missing one or vice versa.
+    An interlock that acts already keeps its cause, unless its missing value is received or its value becomes missing.
     """
     before = {each.number: each for each in acting}
     after = dict(before)

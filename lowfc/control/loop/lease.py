@@ -19,7 +19,7 @@ MAX_HOLDER_LENGTH = 200
 """Most characters of the holder's description."""
 
 ENDED_BY = frozenset({"safe", "open", "pause", "stop"})
-"""Requests granted to every client, which end another client's lease; `safe` also ends the holder's own."""
+"""Requests granted to every client; they end another client's lease, and `safe` also ends the client's own."""
 UNRELATED = frozenset({"status", "note", "lease", "renew", "release", "permit"})
 """Requests that do not change the loop, and the requests for leases themselves."""
 LEASE_OVER = "the lease ended: "
@@ -54,7 +54,7 @@ class Lease(NamedTuple):
         return self.holder.rpartition(REMAINING_TIME_SEPARATOR)[0] or self.holder
 
     def expired(self, time_ns: int, frame_sequence: int) -> bool:
-        """Whether its time is over, by the clock or by the times of frames."""
+        """Whether the time of the lease is over, by the clock or by the times of frames."""
         return time_ns > self.until_ns or (self.same_start(frame_sequence) and self.last_sequence < frame_sequence)
 
     def same_start(self, frame_sequence: int) -> bool:
@@ -76,9 +76,9 @@ class Lease(NamedTuple):
 def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:
     """Why a request is refused; empty if it is granted.
 
-    Other clients' requests are refused while a lease is in force, and the former holder's after it, so that the holder
-    does not act against the client that ended the lease. `lease` is the last one, in force or ended; `lease_id` is the
-    request's, 0 for none; the time is the controller's.
+    While a lease is in force, requests of other clients are refused. After its end, requests of the former holder are
+    refused, so that it does not act against the client that ended the lease. `lease` is the last lease, in force or
+    ended; `lease_id` is the identity in the request, 0 for none; the time is the controller's.
     """
     if name in ENDED_BY or name in UNRELATED:
         return ""

@@ -89,7 +89,7 @@ def safe_pending(settings: Settings, state: State) -> bool:
 def misfit(state: State) -> str:
     """Why the camera's last received settings do not fit the calibration; empty if they do.
 
-    A calibration that has no settings yet fits any with its shape and saturation.
+    A calibration that has no settings yet fits any settings with its shape and saturation.
     """
     camera, loop = state.conditions.camera, state.loop
     if camera is None or loop is None or not loop.calibration.noll:
@@ -100,7 +100,7 @@ def misfit(state: State) -> str:
 
 
 def uncalibrated(state: State) -> str:
-    """Why no mode can be measured: no calibration, or a computed one for another frame size; empty otherwise."""
+    """Why no mode can be measured: no calibration, or one computed for another frame size; empty otherwise."""
     loop, camera = state.loop, state.conditions.camera
     hint = ": `lowfc commission` measures one"
     if loop is None or not loop.calibration.noll:
@@ -137,7 +137,7 @@ def interlock_or_permit_cause(state: State) -> str:
 
 
 def bench_reported(settings: Settings, state: State, report: BenchReport) -> tuple[State, Outputs]:
-    """Evaluate the interlocks on a bench value; one that begins to act makes the loop safer, and none closes it.
+    """Evaluate the interlocks on a bench value; one that begins to act makes the loop safer, and none closes the loop.
 
     Before the first used frame, `refuse_close` also opens a loop that started closed. While the gains are measured,
     `open` and `refuse_close` keep the loop from closing by itself afterwards.

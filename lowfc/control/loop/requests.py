@@ -90,7 +90,7 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
     """Requests open, close, safe, clear and pause; a paused loop is open, and holds its command until closed again."""
     name = "open" if request.name == "pause" else request.name
     after = _granted(state, name)
-    if request.name == "clear":  # resets the newest frame's sequence, and by its `clear_id` the mirror's
+    if request.name == "clear":  # resets the newest sequence here and, by `clear_id`, in the mirror
         conditions = state.conditions._replace(clear_id=request.time_ns)
         state = state._replace(frame_sequence=0, conditions=conditions)
     reply, paused = _REPLIES[request.name], state.conditions.mode_cause == PAUSED

@@ -1,6 +1,6 @@
 """Limits of the mirror, changes of the loop mode and the command timeout, independent of control law and estimate.
 
-The controller applies them to the commands that it sends, and the mirror again to those that it receives;
+The controller applies them to the commands that it sends, and the mirror again to the commands that it receives;
 `docs/explanation/safety.md` lists the hazards.
 """
 
@@ -157,7 +157,7 @@ def limit(limits: Limits, previous_nm: Single, requested_nm: Single) -> Limited:
         kept = previous_nm + move
         lowest_nm, highest_nm = _range_nm(kept)
     apart_nm = limits.neighbour_nm - limits.margin_nm / 2
-    # If no two actuators differ that much, no neighbours do; this check is far cheaper than one of each pair.
+    # If no two actuators differ that much, no neighbours do; this check is far cheaper than a check of each pair.
     if highest_nm - lowest_nm > apart_nm and neighbour_difference_nm(kept) > apart_nm:
         reasons.append(Limit.NEIGHBOUR)
         kept = _shorten(limits, previous_nm, kept)

@@ -122,7 +122,7 @@ class LawRunner(NamedTuple):
 
     @property
     def weight(self) -> np.float32 | Single:
-        """The law's share of the command, one number or (modes,); the rest is the integrator's."""
+        """The law's share of the command, one number or (modes,); the integrator has the rest."""
         weight = np.float32(min(max(self.frames - SETTLING_FRAMES, 0) / FADING_FRAMES, 1))
         return weight if self.guard is None or not self.guard.overruled else weight * self.guard.weight
 
@@ -213,7 +213,7 @@ class ActiveLoop(NamedTuple):
         return self._replace(integrator=replace(integrator, uncorrected=self.automatic & (integrator.gain == 0)))
 
     def with_weighting(self, weighting: Weighting | None) -> "ActiveLoop":
-        """A copy with R and `to_modes` for this weighting; with None, they are those of the calibration."""
+        """A copy with R and `to_modes` for this weighting; for None, with R and `to_modes` of the calibration."""
         calibration, channels = self.calibration, self.command_channels
         to_modes = _own_to_modes(calibration, self.inverse)
         if weighting is not None:
@@ -279,7 +279,7 @@ class Conditions(NamedTuple):
         clear_id: identity of the operator's last clear; 0 without one.
         mode_since_ns: time of the change to this loop mode.
         mode_cause: cause of this change.
-        lease: the reservation of the loop, or the last one that ended; None before the first.
+        lease: the lease in force, or else the last lease; None before the first.
         mirror_fault: why the mirror does not follow commands; empty if it does.
         acting: the acting interlocks.
     """
@@ -298,7 +298,8 @@ class State(NamedTuple):
     """Everything the next command depends on.
 
     Attributes:
-        frame_sequence: sequence of the newest frame, 0 before the first and after `clear`; its time is `frame_time_ns`.
+        frame_sequence: sequence of the newest frame; 0 before the first frame and after `clear`.
+        frame_time_ns: time of the newest frame.
         refused: why the last frame was refused; None if it was used.
         refused_count: number of frames refused in a row, up to the last frame.
         limits_hit: limits that acted on the last command.
@@ -332,7 +333,7 @@ class State(NamedTuple):
 
     @property
     def may_command(self) -> bool:
-        """Whether commands may be sent; to a faulty mirror, which might jump, the first one only in safe mode."""
+        """Whether commands may be sent; the first command to a faulty mirror, which might jump, only in safe mode."""
         return self.commanded or not self.conditions.mirror_fault or self.mode is LoopMode.SAFE
 
     @property
