@@ -6,8 +6,8 @@ from math import log
 import numpy as np
 
 _MIN_NS = 1_000
-RATIO = 1.01  # ratio of the upper to the lower edge of a bin
-_BINS_PER_LOG = 1 / log(RATIO)  # bins for each factor of e
+BIN_RATIO = 1.01  # ratio of the upper to the lower edge of a bin
+_BINS_PER_LOG = 1 / log(BIN_RATIO)  # bins for each factor of e
 _BINS = 2_000
 
 
@@ -29,5 +29,5 @@ class Durations:
     def percentiles_ns(self, *fractions: float) -> list[int]:
         """Percentiles for these fractions (0 to 1), rounded up to the edge of a bin; 0 if nothing was counted."""
         indices = np.searchsorted(np.cumsum(self._counts), np.ceil(np.array(fractions) * self.count))
-        edges_ns = [round(_MIN_NS * RATIO ** int(index)) if index < _BINS - 1 else self.max_ns for index in indices]
+        edges_ns = [round(_MIN_NS * BIN_RATIO ** int(index)) if index < _BINS - 1 else self.max_ns for index in indices]
         return [min(edge_ns, self.max_ns) for edge_ns in edges_ns]

@@ -6,7 +6,7 @@ The Cramer-Rao bound holds for a given sensor, the quantum limit for any measure
 import numpy as np
 
 from lowfc.arrays import Array
-from lowfc.control.calibration.calibration import SINGULAR, condition_number
+from lowfc.control.calibration.calibration import SINGULAR_CONDITION, condition_number
 from lowfc.optics.chain.grid import OPEN_AREA
 
 
@@ -46,7 +46,7 @@ def cramer_rao(H: Array, variance: Array) -> Array:
     """
     weights = np.divide(1.0, variance, out=np.zeros_like(variance), where=variance > 0)
     weighted = np.sqrt(weights)[:, None] * H
-    if not condition_number(weighted) < SINGULAR:
+    if not condition_number(weighted) < SINGULAR_CONDITION:
         raise ValueError("the sensor cannot tell the modes apart: its Fisher information is singular; use fewer modes")
     inverse = np.linalg.pinv(weighted)
     return np.asarray(inverse @ inverse.T)

@@ -15,7 +15,7 @@ from lowfc.arrays import Array, Complex
 from lowfc.control.calibration.calibration import reconstructor
 from lowfc.design.merit import BAND, WAVELENGTH_NM, PupilForms, Signal
 from lowfc.design.paper import MODES, TABLE3_INPUT_WAVES
-from lowfc.design.trials import LITERAL_WAVES, bounds_waves, input_rms, random_wavefronts, residual_rms
+from lowfc.design.trials import PAPER_BOUNDS_WAVES, bounds_waves, input_rms, random_wavefronts, residual_rms
 from lowfc.optics.chain import pupil
 from lowfc.optics.chain.band import Band, monochromatic
 from lowfc.optics.chain.fourier import to_image
@@ -54,7 +54,7 @@ class FocalLight:
         fields = {nm: np.array([focal(sensor.pupil * shape, nm) for shape in (1.0, *modes)]) for nm in all_nm}
         forms, drawn, aberrated = PupilForms.of(sensor.pupil, modes), {}, {}
         for count in MODES:
-            nolls, (low, high) = NOLLS_20[:count], LITERAL_WAVES
+            nolls, (low, high) = NOLLS_20[:count], PAPER_BOUNDS_WAVES
             scale = TABLE3_INPUT_WAVES[count] / input_rms(forms.gram[:count, :count], bounds_waves(nolls, low, high))
             waves = random_wavefronts(np.random.default_rng(_SEED), _WAVEFRONTS, nolls, low * scale, high * scale)
             phases = (np.tensordot(wavefront, modes[:count], 1) for wavefront in waves)

@@ -211,7 +211,7 @@ def properties(quarter: Array, request: Request) -> MaskProperties:
     )
 
 
-def stored(quarter: Array, request: Request) -> NDArray[np.floating]:
+def in_shortest_type(quarter: Array, request: Request) -> NDArray[np.floating]:
     """The mask, transmissions (cells, cells), in the shortest floating-point type that meets the contrast."""
     for kind in (np.float16, np.float32):
         short: NDArray[np.floating] = quarter.astype(kind)

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from lowfc.arrays import Array
 from lowfc.optics.chain.zernike import noll_to_orders
 
-LITERAL_WAVES = (0.04, 0.016)
+PAPER_BOUNDS_WAVES = (0.04, 0.016)
 """Bounds of coefficients in the paper's Sect. 3.1, waves rms, for radial degrees 1 and 2, and for higher degrees: a
 coefficient lies between minus and plus its bound."""
 

@@ -19,7 +19,7 @@ from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.sections import SensorSection
 from lowfc.design import shaped_pupil
 from lowfc.design.linear_program import NotSolvedError
-from lowfc.design.shaped_pupil import Request, exchange, is_feasible, properties, relative_field, stored
+from lowfc.design.shaped_pupil import Request, exchange, in_shortest_type, is_feasible, properties, relative_field
 from lowfc.optics.chain.added_contrast import ModalContrast
 from lowfc.optics.chain.fourier import to_image
 from lowfc.optics.chain.grid import OPEN_AREA, SAMPLES, image_axis, pupil_axis
@@ -138,7 +138,7 @@ def test_a_mask_with_octant_symmetry_is_as_open_as_one_with_quarter_symmetry():
 
 def test_mask_is_stored_in_the_shortest_type_that_meets_the_contrast():
     mask = designed(SMALL)
-    kinds = {stored(mask.quarter, replace(SMALL, contrast=contrast)).dtype for contrast in (1e-9, 1e-7)}
+    kinds = {in_shortest_type(mask.quarter, replace(SMALL, contrast=contrast)).dtype for contrast in (1e-9, 1e-7)}
     assert kinds == {np.dtype(np.float32), np.dtype(np.float16)}
 
 

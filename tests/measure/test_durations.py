@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lowfc.control.durations import RATIO, Durations
+from lowfc.control.durations import BIN_RATIO, Durations
 
 
 def test_percentiles_agree_with_numpys_to_one_bin() -> None:
@@ -15,7 +15,7 @@ def test_percentiles_agree_with_numpys_to_one_bin() -> None:
     fractions = (0.5, 0.99, 0.999, 1.0)
     exact = np.quantile(values_ns, fractions, method="inverted_cdf")
     found = durations.percentiles_ns(*fractions)  # rounded up to the edge of a bin
-    assert all(true_ns <= found_ns <= 1 + true_ns * RATIO for found_ns, true_ns in zip(found, exact, strict=True))
+    assert all(true_ns <= found_ns <= 1 + true_ns * BIN_RATIO for found_ns, true_ns in zip(found, exact, strict=True))
     assert (durations.count, durations.max_ns) == (5000, values_ns.max())
 
 

@@ -18,7 +18,13 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError, LowfcError, raised_as
 from lowfc.contract.messages import fields_of
 from lowfc.contract.sections import InterlockSection
-from lowfc.control.calibration.calibration import Calibration, noise_nm2, normalise_flux, reconstructor, unnormalised
+from lowfc.control.calibration.calibration import (
+    Calibration,
+    for_unnormalised_images,
+    noise_nm2,
+    normalise_flux,
+    reconstructor,
+)
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.interlocks import Action, Interlock
 from lowfc.control.loop.safety import Limits, LoopMode
@@ -250,7 +256,7 @@ def actuators_to_modes(
         on_nodes: Wavefront of the mirror at the twin's nodes.
         opd_nm: Wavefront at the twin's used nodes at which R was computed; flat when None.
     """
-    sensed = projected_response(optics, unnormalised(reconstructor, reference, good), opd_nm)
+    sensed = projected_response(optics, for_unnormalised_images(reconstructor, reference, good), opd_nm)
     return np.asarray(sensed @ poke_wavefronts_nm(on_nodes))
 
 

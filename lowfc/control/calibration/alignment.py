@@ -17,12 +17,12 @@ from scipy.optimize import least_squares
 
 from lowfc.arrays import Array, Complex, Mask
 
-_ANGLES = 72
+_TRIAL_ROTATIONS = 72
 """Number of rotations that are tried before the fit, spread over 180 degrees."""
 _MAX_RESIDUAL_RATIO, _SMALL_RESIDUAL = 2.0, 0.01
 """The parity with the larger residual is possible, too, if this residual is below
 `_MAX_RESIDUAL_RATIO` times the smaller one, or below `_SMALL_RESIDUAL`."""
-_CIRCULAR = 0.05
+_CIRCULAR_CHANGE = 0.05
 """An image counts as circular if rotations change it by less than this fraction; sampling changes a circle by 0.01."""
 
 
@@ -110,7 +110,7 @@ def align(real: Array, computed: Array, good: Mask | None = None) -> Alignment:
     fits = []
     for parity in (1, -1):
         guesses = []
-        for scale, angle in product(scales, np.arange(_ANGLES) * 180.0 / _ANGLES):
+        for scale, angle in product(scales, np.arange(_TRIAL_ROTATIONS) * 180.0 / _TRIAL_ROTATIONS):
             placed, guess = _placed(computed, Geometry(scale, 0.0, 0.0, float(angle), parity), real.shape, spectrum)
             guesses.append((_residual(placed[used], real[used])[0], guess))
         guesses.sort(key=lambda each: each[0])
@@ -137,7 +137,7 @@ def _circular(spline: Array, computed: Array) -> bool:
     down, across = np.ogrid[:rows, :columns]
     inside = np.hypot(down - centre.row, across - centre.column) < min(rows, columns) / 2 - 1
     turned = (_sample(spline, replace(centre, rotation_deg=angle), computed.shape) for angle in (15.0, 40.0))
-    return all(_residual(image[inside], computed[inside])[0] < _CIRCULAR for image in turned)
+    return all(_residual(image[inside], computed[inside])[0] < _CIRCULAR_CHANGE for image in turned)
 
 
 def _doubled(shape: tuple[int, ...]) -> tuple[int, int]:

@@ -11,10 +11,10 @@ from lowfc.control.loop.camera import CameraSettings
 
 ESTIMATORS = ("weighted", "pinv")
 
-SINGULAR = 1e8
+SINGULAR_CONDITION = 1e8
 """Condition number of H above which the sensor cannot tell the modes apart."""
 
-FIRST = "+first"
+FIRST_SUFFIX = "+first"
 """Suffix of `Calibration.estimator` for the first calibration of a commissioning."""
 
 
@@ -73,7 +73,7 @@ class Calibration:
     @property
     def provisional(self) -> bool:
         """Whether it is the first calibration of a commissioning, whose accuracy has not been checked."""
-        return self.estimator.endswith(FIRST)
+        return self.estimator.endswith(FIRST_SUFFIX)
 
     @classmethod
     def none(cls, grid: tuple[int, int]) -> "Calibration":
@@ -110,7 +110,7 @@ def array_shapes(modes: int, shape: tuple[int, int], grid: tuple[int, int]) -> d
     }
 
 
-def comparable(one: Calibration, other: Calibration) -> bool:
+def same_frames_and_modes(one: Calibration, other: Calibration) -> bool:
     """Whether two calibrations have frames of the same size and the same modes."""
     return one.shape == other.shape and one.noll == other.noll
 
@@ -126,7 +126,7 @@ def normalise_flux(reference: Array, response: Array, good: Array) -> tuple[Arra
     return fraction, response / flux - np.outer(fraction, change)
 
 
-def unnormalised(reconstructor: Array, reference: Array, good: Array) -> Array:
+def for_unnormalised_images(reconstructor: Array, reference: Array, good: Array) -> Array:
     """R' (modes, pixels) for images not divided by their flux: R' H = R N, H in I0's unit per nm, N normalised H."""
     flux = _flux(reference, good)
     return np.asarray((reconstructor - np.outer(reconstructor @ reference / flux, good)) / flux)
@@ -177,16 +177,16 @@ def reconstructor(
         raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
     root = np.sqrt(weights)[:, None]
     scaled = root * response
-    if not condition_number(scaled) < SINGULAR:
+    if not condition_number(scaled) < SINGULAR_CONDITION:
         raise ValueError(
-            f"the sensor cannot tell the modes apart (condition number above {SINGULAR:.0e}): "
+            f"the sensor cannot tell the modes apart (condition number above {SINGULAR_CONDITION:.0e}): "
             "use another sensor or fewer modes; an even-symmetric aperture mask gives no signal of even modes"
         )
     if nuisance is None:
         return np.asarray(np.linalg.pinv(scaled) * root.T)
     both = np.hstack([scaled, root * nuisance])
     sizes = np.linalg.norm(both, axis=0)  # divided out, as pinv drops small singular values, and the units differ
-    if not (sizes.all() and condition_number(both / sizes) < SINGULAR):
+    if not (sizes.all() and condition_number(both / sizes) < SINGULAR_CONDITION):
         raise ValueError("the sensor cannot tell modes and nuisance parameters apart: fit fewer of either")
     inverse = np.linalg.pinv(both / sizes) / sizes[:, None]
     return np.asarray((inverse * root.T)[: response.shape[1]])

@@ -81,14 +81,14 @@ def check_dark(dark_dn: Array, reference: Array, flux_dn: float) -> None:
     Raises:
         ValueError: the dark contains too much light.
     """
-    light = light_in(dark_dn, reference)
+    light = starlight_dn(dark_dn, reference)
     if light > _MAX_LIGHT * flux_dn:
         raise ValueError(
             f"the dark frames are not dark: {light / flux_dn:.1%} of the star's light is in them; block the star"
         )
 
 
-def light_in(dark_dn: Array, reference: Array) -> float:
+def starlight_dn(dark_dn: Array, reference: Array) -> float:
     """The star's flux, DN, in a dark (pixels,), DN; the star's reference image (pixels,) is in flux fractions.
 
     Each pixel yields a flux. The result is their median, weighted by the reference, since some pixels may be hot.

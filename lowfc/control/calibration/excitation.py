@@ -11,8 +11,8 @@ from lowfc.arrays import Array, Integers, Single
 
 MIN_CYCLES_OF_LINE = 3
 """Least number of cycles of a line in a period; with fewer, the line cannot be told from a drift of the mean."""
-_APART = 3  # least distance between two lines of a mode, in odd bins: the noise is measured between them
-_DRAWS = 32  # number of random sets of phases; the set with the lowest peak is used
+_MIN_DISTANCE = 3  # least distance between two lines of a mode, in odd bins: the noise is measured between them
+_PHASES = 32  # number of random sets of phases; the set with the lowest peak is used
 
 
 def lines(period_frames: int, modes: int, lines_per_mode: int, lowest: float, highest: float) -> list[Integers]:
@@ -42,7 +42,7 @@ def lines(period_frames: int, modes: int, lines_per_mode: int, lowest: float, hi
     first = int(np.ceil(lowest * period_frames)) | 1
     last = min(highest * period_frames, period_frames // 2 - 1)  # below half of the rate, where a sine has no phase
     count = modes * lines_per_mode
-    step = 2 * -(-_APART // modes)
+    step = 2 * -(-_MIN_DISTANCE // modes)
     places = (np.geomspace(first, last, count).astype(np.intp) - 1) | 1
     places[0] = first
     ahead = np.arange(count) * step
@@ -73,7 +73,7 @@ def multisine(period_frames: int, bins: list[Integers], rms_nm: float, seed: int
         spectrum[places] = height * np.exp(2j * np.pi * rng.random(len(places)))
         return np.fft.irfft(spectrum, period_frames)
 
-    columns = [min((drawn(places) for _ in range(_DRAWS)), key=lambda column: np.abs(column).max()) for places in bins]
+    columns = [min((drawn(places) for _ in range(_PHASES)), key=lambda column: np.abs(column).max()) for places in bins]
     return np.stack(columns, axis=1).astype(np.float32)
 
 

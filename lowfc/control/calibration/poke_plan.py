@@ -88,7 +88,7 @@ def frames_for_snr(snr: float, noise_nm: float, amplitude_nm: float) -> int:
     return int(np.ceil((snr * noise_nm / amplitude_nm) ** 2))
 
 
-def seen(table: Array, weights: Array, sequence: npt.NDArray[np.integer], commanded: Mask) -> Array:
+def seen_rows(table: Array, weights: Array, sequence: npt.NDArray[np.integer], commanded: Mask) -> Array:
     """Rows of a table (frames, columns) that exposures saw.
 
     Args:
@@ -114,7 +114,7 @@ def seen(table: Array, weights: Array, sequence: npt.NDArray[np.integer], comman
     return np.asarray(sum(weight * in_force[at - lag] for lag, weight in enumerate(weights)))
 
 
-def usable(plan: Plan, sequence: npt.NDArray[np.integer], commanded: Mask, lag: int) -> Mask:
+def usable_exposures(plan: Plan, sequence: npt.NDArray[np.integer], commanded: Mask, lag: int) -> Mask:
     """Whether each exposure (exposures,) sees a usable row, with no command missing since the frame before this row.
 
     Args:

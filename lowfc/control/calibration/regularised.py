@@ -13,7 +13,7 @@ from lowfc.arrays import Array, Single
 from lowfc.control.calibration.calibration import ESTIMATORS
 from lowfc.control.calibration.response_fit import WORST_CONDITION
 
-_SINGULAR = (
+_NOT_TOLD_APART = (
     "the response does not tell the modes apart: use more cycles, a larger amplitude or a brighter star; or drop "
     "combinations of modes with --truncate"
 )
@@ -78,7 +78,7 @@ def reconstruct(
         rows = initial * good
         product = rows @ response
         if not np.linalg.cond(product) < WORST_CONDITION:
-            raise ValueError(_SINGULAR)
+            raise ValueError(_NOT_TOLD_APART)
         unbiased = np.linalg.solve(product, rows)
         power = np.linalg.inv((unbiased * variance) @ unbiased.T)  # H'WH for the weighted estimator
         signal = power @ unbiased
@@ -86,7 +86,7 @@ def reconstruct(
     squares, combinations = squares[::-1], combinations[:, ::-1]
     smallest = max(1e-16, truncate**2) * squares[0]
     if not squares[0] > 0 or (truncate == 0 and not squares[-1] > smallest):
-        raise ValueError(_SINGULAR)
+        raise ValueError(_NOT_TOLD_APART)
     kept = np.where(squares > smallest, squares / (squares + tikhonov**2 * squares[0]), 0.0)
     inverse = (combinations * (kept / np.where(squares > smallest, squares, 1.0))) @ combinations.T
     matrix = inverse @ signal

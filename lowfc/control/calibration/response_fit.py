@@ -25,11 +25,11 @@ WORST_CONDITION = 1e3
 """Condition number of R H above which a reconstructor does not tell the modes apart."""
 _WORST_INSTRUMENT = 1e6
 """Condition number of cov(seen, z) above which the pokes do not tell the modes apart."""
-_OUTLIER = 4.0
+_OUTLIER_SIGMAS = 4.0
 """Standard deviations from the median to which outlying cycles are clipped."""
 _MEDIAN_NOISE = 1.2
 """Ratio of the noise of the median of a few values to the noise of their mean."""
-_BETTER = 0.95
+_NOISE_RATIO = 0.95
 """A later candidate is chosen if its noise is below this fraction of an earlier one's."""
 _MEAN_SQUARE_ERRORS = 3.0
 """Standard errors by which the mean square of the elements may exceed its limit."""
@@ -160,7 +160,7 @@ def cycle_response(
     if not poked.any():
         raise ValueError("no frame with a poke is usable: all were lost or refused")
     y, x, z = fractions[used][poked], x[poked], z[poked]
-    slow = _slow(np.flatnonzero(used)[poked], len(used), slowest)
+    slow = _slow_changes(np.flatnonzero(used)[poked], len(used), slowest)
     z = z - slow @ (slow.T @ z)
     covariance = (x - x.mean(axis=0)).T @ z
     if not np.linalg.cond(covariance) < _WORST_INSTRUMENT:
@@ -173,7 +173,7 @@ def cycle_response(
     return Cycle(response, reference, float(flux_dn[used].mean()))
 
 
-def _slow(times: Integers, frames: int, slowest: float) -> Array:
+def _slow_changes(times: Integers, frames: int, slowest: float) -> Array:
     """Orthonormal basis (times, functions) of slow changes in a piece: the mean, and all cosines below `slowest`."""
     orders = np.arange(1 + int(2 * frames * slowest))
     return np.linalg.qr(np.cos(np.pi * np.outer((times + 0.5) / frames, orders)))[0]
@@ -200,7 +200,7 @@ def without_outliers(products: Array) -> Array:
     median = np.median(products, axis=0)
     # 1.48: ratio of standard to median absolute deviation; one scale per row, since its elements have the same noise
     scale = 1.48 * np.median(np.abs(products - median), axis=(0, 2))[:, None]
-    return np.clip(products, median - _OUTLIER * scale, median + _OUTLIER * scale)
+    return np.clip(products, median - _OUTLIER_SIGMAS * scale, median + _OUTLIER_SIGMAS * scale)
 
 
 def row_error(products: Array) -> Array:
@@ -223,7 +223,7 @@ def row_error(products: Array) -> Array:
 
 
 def best_initial(candidates: list[Initial], response: Array, mode: int, variance: Array) -> Initial:
-    """The candidate with the least noise in a mode; a later one replaces it if below `_BETTER` times its noise.
+    """The candidate with the least noise in a mode; a later one replaces it if below `_NOISE_RATIO` times its noise.
 
     The response (pixels,) to a poke of the mode is in flux fractions; `variance` (pixels,) is a frame's noise variance.
     """
@@ -235,7 +235,7 @@ def best_initial(candidates: list[Initial], response: Array, mode: int, variance
 
     best, *later = candidates
     for each in later:
-        if noise(each) < _BETTER * noise(best):
+        if noise(each) < _NOISE_RATIO * noise(best):
             best = each
     return best
 

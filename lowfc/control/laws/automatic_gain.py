@@ -155,7 +155,7 @@ class GainBank:
         """Whether the window is complete, so that there is a verdict."""
         return len(self._excesses) == BLOCKS
 
-    def early(self, gain: Single) -> Single:
+    def early_gains(self, gain: Single) -> Single:
         """Gains (modes,) to use before the window is complete, from the gains in use.
 
         A mode with a gain of 0 or the least gain gets a better gain if there is one (see `EARLY_BLOCKS`). A mode whose

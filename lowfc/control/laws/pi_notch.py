@@ -10,8 +10,8 @@ from lowfc.arrays import Array
 from lowfc.control.laws.linear_law import Block, LinearLaw, law_from_blocks
 from lowfc.control.laws.stability import delay_weights
 
-_EXACT = 1e-6  # noise variance of the limited commands in `_correction`; the Riccati equation needs a value above 0
-_UNKNOWN = 1e-3
+_COMMAND_NOISE = 1e-6  # noise variance of limited commands in `_correction`; the Riccati equation needs one above 0
+_STATE_NOISE = 1e-3
 """Variance of unknown changes of the states in `_correction`: with a larger value, the return from a limit takes
 longer; with a smaller one, wrong states last longer."""
 
@@ -116,6 +116,8 @@ def _correction(P: Array, B: Array, C: Array) -> Array:
     if len(C) == 2:
         return np.array([1.0, 0.0])
     unknown = np.concatenate([[1.0, 0.0], np.repeat(1 / np.sum(C[2:].reshape(-1, 2) ** 2, axis=1), 2)])
-    covariance = solve_discrete_are(P.T, C[:, None], np.outer(B, B) + _UNKNOWN * np.diag(unknown), [[_EXACT]])
+    covariance = solve_discrete_are(
+        P.T, C[:, None], np.outer(B, B) + _STATE_NOISE * np.diag(unknown), [[_COMMAND_NOISE]]
+    )
     towards = covariance @ C
     return np.asarray(towards / (C @ towards))

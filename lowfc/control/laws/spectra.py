@@ -140,7 +140,7 @@ def floor_nm2_hz(found: Spectrum) -> Array:
     return np.asarray(np.median(upper, axis=0) / (1 - 2 / (9 * freedom)) ** 3)
 
 
-def in_bins(frequency_hz: Array, columns: Sequence[Array]) -> tuple[Array, list[Array]]:
+def means_in_bins(frequency_hz: Array, columns: Sequence[Array]) -> tuple[Array, list[Array]]:
     """Means of the frequencies and of each column in bins, twenty per decade of frequency, without 0 Hz.
 
     Columns are (frequencies,), and their means (bins,).

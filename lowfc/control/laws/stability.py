@@ -14,7 +14,7 @@ MIN_GAIN_MARGIN = 1.8  # factor by which the gain may grow
 MIN_PHASE_MARGIN_DEG = 45.0
 LOWEST_GAIN = 0.01
 """Least gain that `lowfc tune` chooses, so that even a mode whose drift is hidden by a log's noise is corrected."""
-SETTLING = 5.0
+SETTLING_TIME_CONSTANTS = 5.0
 """Time constants of the slowest mode after which a loop counts as settled."""
 
 _LONGEST_DELAY = 1000  # frames; a longer delay, from a damaged file or message, could exceed the memory
@@ -25,7 +25,7 @@ _BISECTIONS = 50
 def settling_frames(gain: Array | Single, leak: Array | Single, least: float = 0.0) -> int:
     """Frames from closing until the slowest mode has settled, at least `least`; gain, leak (modes,) without unit."""
     slowest = float((gain + leak)[gain + leak > 0].min(initial=1.0))
-    return int(np.ceil(max(SETTLING / slowest, least)))
+    return int(np.ceil(max(SETTLING_TIME_CONSTANTS / slowest, least)))
 
 
 def delay_weights(delay_frames: float) -> Array:

@@ -23,7 +23,7 @@ Controller = Callable[[Any, Single, Single], tuple[Any, Single]]
 MAX_DELAY_FRAMES = 5
 """Longest plausible delay of a working loop, frames."""
 _STILL_NM = 0.01  # rms difference of successive commands below which they hardly move
-_FEWEST = 20  # least number of steps or commands from which a delay is determined
+_MIN_STEPS = 20  # least number of steps or commands from which a delay is determined
 _NOT_NEW = sum(1 << reason for reason in NOT_NEW)
 
 
@@ -116,7 +116,7 @@ def delay_from_truth(true_nm: Single, command_nm: Single, missing: Integers) -> 
     move, or if fewer than 20 rows are finite.
     """
     rows = np.isfinite(true_nm).all(axis=1)
-    if rows.sum() < _FEWEST:
+    if rows.sum() < _MIN_STEPS:
         return None
     first_nm, best = command_nm[0], (np.inf, 1.0)
     for lag in range(1, MAX_DELAY_FRAMES):
@@ -153,7 +153,7 @@ def delay_from_times(
     neighbours = sequence[after] - sequence[after - 1] == 1  # otherwise an earlier frame may be missing from the log
     delay = (sequence[after] - commanding).astype(np.int64)[neighbours]
     delay = delay[(delay >= 1) & (delay <= 2 * MAX_DELAY_FRAMES)]
-    return float(delay.mean()) if len(delay) >= _FEWEST else None
+    return float(delay.mean()) if len(delay) >= _MIN_STEPS else None
 
 
 def frames_since(begins: Mask, running: Mask, missing: Integers) -> Integers:

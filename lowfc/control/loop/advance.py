@@ -70,7 +70,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     if frame.sequence <= state.frame_sequence:
         stale = Rejection.REPEATED if frame.sequence == state.frame_sequence else Rejection.OUT_OF_ORDER
         return _refuse(settings, state, frame, stale, events)
-    state, loop = _arrive(state, frame, events)
+    state, loop = _after_missing_frames(state, frame, events)
     lease_ended = False
     if state.conditions.lease is not None:
         state = lease_at_frame(settings, state._replace(loop=loop), frame)
@@ -135,7 +135,7 @@ def _command_message(state: State, loop: ActiveLoop, command_nm: Single) -> Comm
     return Command(sequence, state.frame_time_ns, loop.actuators_nm, command_nm, safe, clear_id)
 
 
-def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[State, ActiveLoop | None]:
+def _after_missing_frames(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[State, ActiveLoop | None]:
     """The state, and the active loop advanced by the frames missing before this one."""
     if state.frame_timeout and state.frame_time_ns:
         events.append(PendingEvent("FRAMES_BACK", {"silent_ms": (frame.time_ns - state.frame_time_ns) / 1e6}))

@@ -93,7 +93,7 @@ def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:
     return f"the request's reservation ended: {lease.ended}"
 
 
-def asked_by(held: Lease | None, request: Request) -> str:
+def request_cause(held: Lease | None, request: Request) -> str:
     """Cause of a change of the loop: the request and the purpose of its lease, or the text from automatic gains."""
     if request.text.startswith(f"{AUTO}: "):
         return request.text

@@ -14,7 +14,7 @@ from lowfc.control.loop import interlocks
 from lowfc.control.loop.command_channels import EXTERNAL, FLAT, MIRROR, CommandChannels, Play, play_table
 from lowfc.control.loop.gains import change_integrator, check_offset, offset_remark, per_mode, prepare_gains
 from lowfc.control.loop.inputs import Outputs, PendingEvent, Reply, Request
-from lowfc.control.loop.lease import ENDED_BY, Lease, asked_by, refusal
+from lowfc.control.loop.lease import ENDED_BY, Lease, refusal, request_cause
 from lowfc.control.loop.loading import holding_cause, in_mode, loaded, misfit, mode_events, safe_pending, uncalibrated
 from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, permit, release, renew
 from lowfc.control.loop.safety import MAX_LIMIT_NM, Limits, LoopMode, Rejection, neighbour_difference_nm, request_mode
@@ -40,7 +40,7 @@ def answer(settings: Settings, state: State, request: Request) -> tuple[State, O
         return state._replace(), Outputs(reply=refused)  # a copy, since the same object is not counted
     by_another = lease_before is not None and lease_before.id != request.lease_id
     if request.name == "safe" or (request.name in ENDED_BY and by_another):
-        after, lease_events = lease_ended(after, asked_by(lease_before, request))
+        after, lease_events = lease_ended(after, request_cause(lease_before, request))
         events += lease_events
         text += "".join(f"; this ended the reservation for {event.details['holder']}" for event in lease_events)
     events += mode_events(state, after)
@@ -94,7 +94,7 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
         conditions = state.conditions._replace(clear_id=request.time_ns)
         state = state._replace(frame_sequence=0, conditions=conditions)
     reply, paused = _REPLIES[request.name], state.conditions.mode_cause == PAUSED
-    cause = asked_by(state.conditions.lease, request)
+    cause = request_cause(state.conditions.lease, request)
     if request.name == "pause" and state.mode is LoopMode.OPEN and not paused:
         reply = "the loop is open already, and holds the command"
     if request.name == "close" and state.mode is LoopMode.CLOSED and not state.steps_left:
@@ -159,7 +159,7 @@ def _step(settings: Settings, state: State, request: Request) -> Handled:
     if not (1 <= frames <= MAX_STEPS and frames == int(frames)):
         given = " ".join(map("{:g}".format, request.values)) or "none"
         raise ValueError(f"step takes one whole number of frames from 1 to {MAX_STEPS}; got {given}")
-    state = in_mode(state, _granted(state, "close"), request.time_ns, asked_by(state.conditions.lease, request))
+    state = in_mode(state, _granted(state, "close"), request.time_ns, request_cause(state.conditions.lease, request))
     return state._replace(steps_left=int(frames)), f"loop closed for {counted(int(frames), 'frame')}"
 
 

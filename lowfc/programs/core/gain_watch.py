@@ -220,7 +220,7 @@ class GainWatch:
         gain, first_window, events = loop.integrator.gain.copy(), False, []
         for group in judged:
             if not group.bank.complete:
-                early = group.bank.early(loop.integrator.gain[group.mask])
+                early = group.bank.early_gains(loop.integrator.gain[group.mask])
                 gain[group.mask] = np.where(loop.automatic[group.mask], early, gain[group.mask])
                 continue
             first_window |= group.bank.first

@@ -29,10 +29,10 @@ from lowfc.design.shaped_pupil import (
     Request,
     Round,
     exchange,
+    in_shortest_type,
     nearest_feasible,
     properties,
     relative_field,
-    stored,
 )
 from lowfc.optics.chain.pupil import from_quarter
 from lowfc.programs.cli.result import Result, result_field
@@ -92,7 +92,7 @@ def design_spc(request: Request, out: Path, plot: Path | None, console: Console)
             f"{last.contrast:.2e}, not {request.contrast:g}: allow more --rounds, or a lower --limit than "
             f"{request.limit:g}"
         )
-    quarter = stored(last.quarter, request)
+    quarter = in_shortest_type(last.quarter, request)
     made_by = np.array(json.dumps(asdict(request)))
     content = io.BytesIO()
     np.savez_compressed(content, allow_pickle=False, quarter=quarter, made_by=made_by)

@@ -10,10 +10,10 @@ from lowfc.control.calibration.alignment import Geometry, align, onto
 from lowfc.control.calibration.calibration import (
     ESTIMATORS,
     condition_number,
+    for_unnormalised_images,
     noise_nm,
     normalise_flux,
     reconstructor,
-    unnormalised,
 )
 from lowfc.control.loop.estimator import Estimator, difference, saturated_pixels
 from tests.support.toy import TOY, calibration
@@ -45,13 +45,13 @@ def test_an_image_without_light_cannot_be_normalised() -> None:
     with pytest.raises(ValueError, match="no light"):
         normalise_flux(np.zeros(PIXELS), RESPONSE, GOOD)
     with pytest.raises(ValueError, match="no light"):
-        unnormalised(RESPONSE.T, np.zeros(PIXELS), GOOD)
+        for_unnormalised_images(RESPONSE.T, np.zeros(PIXELS), GOOD)
 
 
 def test_a_reconstructor_for_images_not_divided_by_their_flux_measures_the_same_modes() -> None:
     I0, H = normalise_flux(TOY.reference, RESPONSE, SOME_BAD)
     R = reconstructor(I0, H, SOME_BAD, 1e5, 2.0)
-    np.testing.assert_allclose(unnormalised(R, TOY.reference, SOME_BAD) @ RESPONSE, R @ H, atol=1e-12)
+    np.testing.assert_allclose(for_unnormalised_images(R, TOY.reference, SOME_BAD) @ RESPONSE, R @ H, atol=1e-12)
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)

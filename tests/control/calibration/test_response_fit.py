@@ -8,7 +8,7 @@ import pytest
 from lowfc.arrays import single
 from lowfc.control.calibration.adapted import with_dark, with_reference
 from lowfc.control.calibration.calibration import normalise_flux, reconstructor
-from lowfc.control.calibration.dark_frames import light_in, measure_dark
+from lowfc.control.calibration.dark_frames import measure_dark, starlight_dn
 from lowfc.control.calibration.delay_fit import measure_delay
 from lowfc.control.calibration.poke_plan import (
     SIGNS,
@@ -17,8 +17,8 @@ from lowfc.control.calibration.poke_plan import (
     frames_for_snr,
     hadamard_patterns,
     poke_patterns,
-    seen,
-    usable,
+    seen_rows,
+    usable_exposures,
 )
 from lowfc.control.calibration.regularised import advice, reconstruct
 from lowfc.control.calibration.response_fit import (
@@ -88,9 +88,9 @@ def test_the_number_of_frames_grows_with_the_square_of_the_signal_to_noise_ratio
 def test_an_exposure_sees_the_rows_played_before_it_by_the_delay() -> None:
     table = np.arange(1.0, 6.0)[:, None]
     commanded = np.ones(8, np.bool_)
-    one_frame = seen(table, np.array([0.0, 1.0]), np.arange(8), commanded)
+    one_frame = seen_rows(table, np.array([0.0, 1.0]), np.arange(8), commanded)
     assert one_frame[:, 0].tolist() == [0, 1, 2, 3, 4, 5, 0, 0]
-    one_and_a_half = seen(table, np.array([0.0, 0.5, 0.5]), np.arange(8), commanded)
+    one_and_a_half = seen_rows(table, np.array([0.0, 0.5, 0.5]), np.arange(8), commanded)
     assert one_and_a_half[:, 0].tolist() == [0, 0.5, 1.5, 2.5, 3.5, 4.5, 2.5, 0]
 
 
@@ -98,18 +98,18 @@ def test_without_a_command_the_mirror_keeps_the_previous_row() -> None:
     table = np.arange(1.0, 6.0)[:, None]
     weights = np.array([0.0, 1.0])
     commanded = np.array([True, True, False, True, True, True, True])
-    assert seen(table, weights, np.arange(7), commanded)[:, 0].tolist() == [0, 1, 2, 2, 4, 5, 0]
+    assert seen_rows(table, weights, np.arange(7), commanded)[:, 0].tolist() == [0, 1, 2, 2, 4, 5, 0]
     without_frame_2 = np.array([0, 1, 3, 4, 5, 6])
-    assert seen(table, weights, without_frame_2, np.ones(6, np.bool_))[:, 0].tolist() == [0, 1, 2, 4, 5, 0]
+    assert seen_rows(table, weights, without_frame_2, np.ones(6, np.bool_))[:, 0].tolist() == [0, 1, 2, 4, 5, 0]
 
 
 def test_only_exposures_affected_by_a_missing_frame_are_unusable() -> None:
     plan = cycle(poke_patterns(2, 8.0), hold=3, settle=0, rest=0)
     sequence = np.arange(len(plan) + 3)
-    with_all = usable(plan, sequence, np.ones(sequence.size, np.bool_), 1)
+    with_all = usable_exposures(plan, sequence, np.ones(sequence.size, np.bool_), 1)
     assert np.flatnonzero(with_all).tolist() == list(range(1, len(plan) + 1))
     with_gap = np.delete(sequence, 20)
-    usable_with_gap = usable(plan, with_gap, np.ones(with_gap.size, np.bool_), 1)
+    usable_with_gap = usable_exposures(plan, with_gap, np.ones(with_gap.size, np.bool_), 1)
     assert sorted(set(np.flatnonzero(with_all)) - set(with_gap[usable_with_gap])) == [20, 21, 22]
 
 
@@ -284,9 +284,9 @@ def test_a_dark_shows_hot_noisy_and_dead_pixels_and_light_of_the_star() -> None:
     assert np.median(dark.dark_dn) == pytest.approx(100, abs=0.1)
     light = np.zeros(6400)
     light[:200] = 1 / 200
-    assert light_in(dark.dark_dn, light) == pytest.approx(0, abs=30)
+    assert starlight_dn(dark.dark_dn, light) == pytest.approx(0, abs=30)
     with_light = measure_dark(frames + 5e3 * light)
-    assert light_in(with_light.dark_dn, light) == pytest.approx(5e3, abs=100)
+    assert starlight_dn(with_light.dark_dn, light) == pytest.approx(5e3, abs=100)
     with pytest.raises(ValueError, match="at least 16 frames"):
         measure_dark(frames[:5])
     for value in (np.nan, np.inf):  # numpy would warn of infinity

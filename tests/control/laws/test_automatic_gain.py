@@ -142,7 +142,7 @@ def test_a_new_drift_gets_a_gain_before_the_window_ends() -> None:
     for count, modes_nm in enumerate(drift(3000, 0.5, 1.0, 9).astype(np.float32)):
         if bank_.add_frame(modes_nm, modes_nm, closed=False):
             assert not bank_.complete
-            early = bank_.early(early)
+            early = bank_.early_gains(early)
             assert count >= 2499 or not early.any()  # before five blocks of 500 frames are complete
     assert (early > 0.01).mean() > 0.9
 
@@ -190,7 +190,7 @@ def test_a_gain_due_to_tilt_cross_talk_is_removed_before_the_window_ends() -> No
     assert gain.all()
     for tilt_of_frame, modes_of_frame in zip(tilt_nm, modes_nm, strict=True):
         if bank_.add_frame(modes_of_frame, modes_of_frame, tilt_of_frame, closed=True):
-            gain = bank_.early(gain)
+            gain = bank_.early_gains(gain)
     assert gain[4] == 0
 
 

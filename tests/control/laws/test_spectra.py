@@ -16,7 +16,7 @@ from lowfc.control.laws.spectra import (
     SHORTEST,
     TimeSeries,
     floor_nm2_hz,
-    in_bins,
+    means_in_bins,
     spectrum,
     time_series,
 )
@@ -107,7 +107,7 @@ def test_a_longer_series_has_a_finer_spectrum() -> None:
 
 def test_bins_are_even_in_the_logarithm_and_preserve_a_straight_line() -> None:
     frequency_hz = np.linspace(0, 250, 1025)
-    centres_hz, (same,) = in_bins(frequency_hz, [frequency_hz])
+    centres_hz, (same,) = means_in_bins(frequency_hz, [frequency_hz])
     assert centres_hz[0] == frequency_hz[1]
     assert np.array_equal(centres_hz, same)
     assert (np.diff(centres_hz) > 0).all()

@@ -16,7 +16,7 @@ from lowfc.contract.errors import CalibrationError, LowfcError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.delay_fit import Delay, NotSeenError, measure_delay
-from lowfc.control.calibration.poke_plan import Plan, seen, usable
+from lowfc.control.calibration.poke_plan import Plan, seen_rows, usable_exposures
 from lowfc.control.calibration.response_fit import Cycle, cycle_response, normalised
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.advance import UNMEASURED
@@ -70,18 +70,18 @@ class Recording(NamedTuple):
 
     def played(self, table: Array, delay_frames: float) -> Array:
         """The table as seen by each exposure (frames, columns)."""
-        return seen(table, _weights(delay_frames), self.steps, self.commanded)[self._steps_of_frames]
+        return seen_rows(table, _weights(delay_frames), self.steps, self.commanded)[self._steps_of_frames]
 
     def commands(self, delay_frames: float) -> Array:
         """The loop's own command as seen by each exposure (frames, modes)."""
         frames = np.arange(self.steps[-1] + 1)
         newest = np.maximum(np.searchsorted(self.steps, frames, "right") - 1, 0)  # for a missing step, the one before
         every_step = np.ones(len(self.steps), np.bool_)
-        return seen(self.command_nm[newest], _weights(delay_frames), self.steps, every_step)[self._steps_of_frames]
+        return seen_rows(self.command_nm[newest], _weights(delay_frames), self.steps, every_step)[self._steps_of_frames]
 
     def usable(self, plan: Plan, delay_frames: float) -> Mask:
         """Whether each frame may be used (frames,)."""
-        return usable(plan, self.steps, self.commanded, int(max(delay_frames, 1.0)))[self._steps_of_frames]
+        return usable_exposures(plan, self.steps, self.commanded, int(max(delay_frames, 1.0)))[self._steps_of_frames]
 
     @property
     def complete(self) -> bool:

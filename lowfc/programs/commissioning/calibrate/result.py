@@ -13,7 +13,7 @@ from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, raised_as
 from lowfc.control.calibration.adapted import on_pixels
-from lowfc.control.calibration.calibration import FIRST, Calibration, comparable
+from lowfc.control.calibration.calibration import FIRST_SUFFIX, Calibration, same_frames_and_modes
 from lowfc.control.calibration.regularised import Reconstruction, advice, reconstruct
 from lowfc.control.calibration.response_fit import MAX_ELEMENT, MAX_ELEMENT_RMS, Check, Measured, cross_talk
 from lowfc.control.loop.wording import counted
@@ -148,7 +148,7 @@ def measured_calibration(
     config: Configuration, in_use: Calibration, measured: Measured, request: CalibrationRequest
 ) -> tuple[Calibration, Reconstruction]:
     """The calibration from cycles of pokes, with dark, mask and mirror commands of the previous one."""
-    estimators = dict.fromkeys([*measured.initial.estimator.removesuffix(FIRST).split("+"), request.method])
+    estimators = dict.fromkeys([*measured.initial.estimator.removesuffix(FIRST_SUFFIX).split("+"), request.method])
     calibration = replace(
         in_use,
         reference=in_use.reference if measured.reference is None else single(measured.reference),
@@ -167,7 +167,7 @@ def measured_calibration(
 
 def computed_noise_nm(config: Configuration, calibration: Calibration, computed: Calibration) -> Array | None:
     """Noise (modes,) of the computed R at the flux of a calibration, nm; None if that R is of another sensor."""
-    if not comparable(calibration, computed):
+    if not same_frames_and_modes(calibration, computed):
         return None
     return factory.frame_noise_nm(config, replace(calibration, reconstructor=computed.reconstructor * calibration.good))
 
@@ -258,7 +258,7 @@ def judge(
 
 def comparison(first: Calibration, second: Calibration) -> Comparison:
     """Differences on the common good pixels: I0 and H of the second calibration, as measured with R of the first."""
-    if not comparable(first, second):
+    if not same_frames_and_modes(first, second):
         raise CalibrationError(
             "calibrations with different sensors or modes cannot be compared: the first has "
             f"{first.shape[0]} x {first.shape[1]} pixels and modes {_span(first)}, the second {second.shape[0]} x "

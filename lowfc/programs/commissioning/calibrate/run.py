@@ -21,7 +21,7 @@ from lowfc.arrays import Array
 from lowfc.client import Client, configuration_of
 from lowfc.contract.errors import CalibrationError, DataFileError, LowfcError
 from lowfc.contract.messages import wire
-from lowfc.control.calibration.calibration import Calibration, comparable
+from lowfc.control.calibration.calibration import Calibration, same_frames_and_modes
 from lowfc.control.calibration.delay_fit import Delay
 from lowfc.control.calibration.regularised import pixel_variance
 from lowfc.control.calibration.response_fit import (
@@ -228,7 +228,7 @@ class Calibrator:
     def _initial(self, delay: Delay) -> Initial:
         """The initial R of the fit: the computed R, unless the R in use measures pokes with less noise."""
         in_use = self.in_use
-        usable = [each for each in (self.computed, in_use) if comparable(each, in_use)]
+        usable = [each for each in (self.computed, in_use) if same_frames_and_modes(each, in_use)]
         candidates = [Initial(each.reconstructor.astype(np.float64) * in_use.good, each.estimator) for each in usable]
         full_rank = [each for each in candidates if np.linalg.matrix_rank(each.matrix) == len(in_use.noll)]
         if not full_rank:

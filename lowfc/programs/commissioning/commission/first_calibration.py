@@ -11,7 +11,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
 from lowfc.control.calibration import poke_plan
 from lowfc.control.calibration.alignment import align
-from lowfc.control.calibration.calibration import FIRST, Calibration
+from lowfc.control.calibration.calibration import FIRST_SUFFIX, Calibration
 from lowfc.control.calibration.delay_fit import Delay
 from lowfc.control.calibration.response_fit import correlation
 from lowfc.programs.commissioning.calibrate.align import (
@@ -96,7 +96,7 @@ def aligned_calibration(
         "image_residual": alignment.residual,
         "poke_correlation": poke_correlation,
     }
-    calibration = replace(calibration, reference=in_use.reference, estimator=f"{calibration.estimator}{FIRST}")
+    calibration = replace(calibration, reference=in_use.reference, estimator=f"{calibration.estimator}{FIRST_SUFFIX}")
     return identified(calibration)
 
 
@@ -109,7 +109,7 @@ def poked_calibration(player: Player, config: Configuration, delay: Delay) -> Ca
     for number in range(CYCLES):
         plan = _poke_cycle(modes, amplitude_nm, number)
         response += player.cycle(plan, delay.delay_frames).response / CYCLES
-    calibration = replace(in_use, response=single(response), estimator=f"{config.control.estimator}+poke{FIRST}")
+    calibration = replace(in_use, response=single(response), estimator=f"{config.control.estimator}+poke{FIRST_SUFFIX}")
     matrix = compute_reconstructor(config, calibration, None).matrix
     player.report(f"{CYCLES} pokes of each mode by {amplitude_nm:.3g} nm")
     return identified(replace(calibration, reconstructor=single(matrix)))

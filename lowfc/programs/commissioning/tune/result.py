@@ -10,7 +10,7 @@ from lowfc.control.laws import margins
 from lowfc.control.laws.continuous import Timing, residual_spectrum
 from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.laws.linear_law import LinearLaw, integrator
-from lowfc.control.laws.spectra import in_bins, spectrum
+from lowfc.control.laws.spectra import means_in_bins, spectrum
 from lowfc.control.laws.tuning import (
     Gains,
     Tuned,
@@ -209,7 +209,7 @@ def picture(data: Telemetry, best: Tuned) -> bytes:
             curves[f"predicted true residual with the {name}"] = colour, residual
         axes.loglog(shown_hz, pol_spectrum.power_nm2_hz[1:, mode], color="0.6", label="pseudo-open-loop")
         if closed is not None:
-            binned_hz, (power,) = in_bins(closed.frequency_hz, [closed.power_nm2_hz[:, mode]])
+            binned_hz, (power,) = means_in_bins(closed.frequency_hz, [closed.power_nm2_hz[:, mode]])
             axes.loglog(binned_hz, power, color="tab:orange", label="measured error")
         for label, (colour, power) in curves.items():
             axes.loglog(shown_hz, 2 / data.rate_hz * _means(power, omega, edges), color=colour, lw=1, label=label)

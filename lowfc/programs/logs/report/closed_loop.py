@@ -14,7 +14,7 @@ from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.error_budget import SensorNoise, sensor_noise
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.margins import noise_transfer, rejection
-from lowfc.control.laws.spectra import SHORTEST, Spectrum, TimeSeries, in_bins, spectrum, time_series
+from lowfc.control.laws.spectra import SHORTEST, Spectrum, TimeSeries, means_in_bins, spectrum, time_series
 from lowfc.control.laws.stability import settling_frames
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
@@ -203,7 +203,7 @@ def _group(name: str, modes: Mask, law: LinearLaw, spectra: Spectra, noise_nm2_h
         if noise_nm2_hz is not None:
             added = noise_transfer(law, frequency_hz)[:, modes] ** 2 * noise_nm2_hz[modes]
             columns["residual_predicted"] = rejected + added.sum(axis=1)
-    centres_hz, means = in_bins(frequency_hz, list(columns.values()))
+    centres_hz, means = means_in_bins(frequency_hz, list(columns.values()))
     binned = dict(zip(columns, means, strict=True))
     ratios = {"measured_over_theory": _amplitude_ratio(binned["error"], binned["error_predicted"])}
     if "residual_predicted" in binned:

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from lowfc.adapters.files.sensors import sensor_named
 from lowfc.adapters.files.twin_cache import load_or_build
 from lowfc.adapters.process.terminal import Json
-from lowfc.design.trials import LITERAL_WAVES, bounds_waves
+from lowfc.design.trials import PAPER_BOUNDS_WAVES, bounds_waves
 from lowfc.optics.chain.band import gauss_legendre, monochromatic
 from lowfc.optics.chain.sensor import image, pupil_radii
 from lowfc.optics.chain.zernike import NOLLS_20, zernikes
@@ -48,7 +48,7 @@ def bench_twin(seconds: float = 1.0) -> dict[str, Any]:
         ("20 % band in 3 wavelengths, rank 60", FAST, gauss_legendre(wavelength_nm)),
     )
     uniform = np.random.default_rng(1).uniform(-1.0, 1.0, (WAVEFRONTS, len(NOLLS_20)))
-    coefficients_nm = wavelength_nm * uniform * bounds_waves(NOLLS_20, *LITERAL_WAVES)
+    coefficients_nm = wavelength_nm * uniform * bounds_waves(NOLLS_20, *PAPER_BOUNDS_WAVES)
     opds_nm = np.tensordot(coefficients_nm, zernikes(NOLLS_20, *pupil_radii(optics)), 1)
     results = []
     with threadpool_limits(1):

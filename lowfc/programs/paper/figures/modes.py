@@ -8,7 +8,7 @@ import numpy as np
 
 from lowfc.arrays import Array
 from lowfc.design.estimators import iterated
-from lowfc.design.trials import LITERAL_WAVES, bounds_waves, expected_r_squared, r_squared, random_wavefronts
+from lowfc.design.trials import PAPER_BOUNDS_WAVES, bounds_waves, expected_r_squared, r_squared, random_wavefronts
 from lowfc.optics.chain.zernike import NOLLS_14, noll_to_orders
 from lowfc.programs.paper import plots
 from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming, prepared
@@ -175,7 +175,7 @@ def _one_wavefront(context: Context, name: str, literal: bool) -> tuple[Array, d
     """One random wavefront (modes,) in waves, and its estimates."""
     sensor = prepared(name)
     wavelength_nm, matched = sensor.optics.wavelength_nm, _matched(sensor)
-    low, high = LITERAL_WAVES if literal else (matched.low, matched.high)
+    low, high = PAPER_BOUNDS_WAVES if literal else (matched.low, matched.high)
     truth = random_wavefronts(context.rng("fig8"), 1, NOLLS_14, low, high)[0]
     image_e = exposed_e(sensor, sensor.image(truth * wavelength_nm), context.rng("fig8", name))
     estimates = iterated_nm(sensor, fits(sensor, MODES), image_e)

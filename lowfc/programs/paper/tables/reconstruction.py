@@ -54,7 +54,7 @@ class Input:
 
 def inputs(sensor: Prepared, modes: int, literal: bool) -> Iterator[Input]:
     """Interpretations of Sect. 3.1: matched to the input of Table 3, and if `literal` also with the text's bounds."""
-    low, high = trials.LITERAL_WAVES
+    low, high = trials.PAPER_BOUNDS_WAVES
     bounds = trials.bounds_waves(NOLLS_20[:modes], low, high)
     literal_rms = trials.input_rms(sensor.gram[:modes, :modes], bounds)
     scale = TABLE3_INPUT_WAVES[modes] / literal_rms

@@ -10,7 +10,7 @@ from lowfc.arrays import Array, Mask
 from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.laws.margins import rejection
-from lowfc.control.laws.spectra import SHORTEST, Spectrum, in_bins, spectrum, time_series
+from lowfc.control.laws.spectra import SHORTEST, Spectrum, means_in_bins, spectrum, time_series
 from lowfc.control.loop.safety import LoopMode, mode_name
 from lowfc.programs.view.draw.colours import GREEN, GREY, YELLOW
 from lowfc.programs.view.draw.plots import BOX_HEIGHT, Axes, at, labels
@@ -105,6 +105,6 @@ def power_curves(spectra: Spectrum, modes: Mask, law: LawInForce | None, rate_hz
         columns.append((squared_rejection * pol[:, modes]).sum(axis=1))
     if not any(column[1:].any() for column in columns):
         return np.zeros(0), []
-    frequency_hz, means = in_bins(spectra.frequency_hz, columns)
+    frequency_hz, means = means_in_bins(spectra.frequency_hz, columns)
     least = _LEAST * max(float(mean.max()) for mean in means)
     return frequency_hz, [np.maximum(mean, least) for mean in means]
