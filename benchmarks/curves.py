@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.load import shares, watched
+from benchmarks.load import sampled_processes, shares
 from benchmarks.runner import Lines, Report, Result, add_times, ranged, us
 from benchmarks.sizes import FRAMES, Size, configuration, prepared_run, random_calibration
 from lowfc.adapters.process.clock import HostClock
@@ -46,10 +46,10 @@ _LOOP = ("frame_to_command_us", "echo_us")
 
 
 def step_times(size: Size, seconds: float) -> Result:
-    """Times of the control step of that size and of its two lower bounds, each repeated for `seconds`.
+    """Times of the control step of a loop of this size and of its two lower bounds, each repeated for `seconds`.
 
-    stream_us: one read of `Size.bytes` bytes by the dot product of one half with the other, the fastest reader among
-    NumPy's sum, max, copy and products. products_us: R times a frame, and the modes' shapes times a command.
+    stream_us: one read of `Size.bytes` bytes, by the dot product of their first half with their second; NumPy's sum,
+    max, copy and other products read more slowly. products_us: R times a frame, and the modes' shapes times a command.
 
     Raises:
         RuntimeError: frames were refused or limits acted.
@@ -71,7 +71,7 @@ def step_times(size: Size, seconds: float) -> Result:
 
 
 def timed(work: Callable[[], object], seconds: float) -> dict[str, float]:
-    """p50, p99 and processor time (cpu) of one call of `work`, us, repeated for `seconds`."""
+    """p50, p99 and mean processor time (cpu) of a call of `work`, us, which is repeated for `seconds`."""
     work()
     durations_ns = []
     end_ns = time.perf_counter_ns() + round(seconds * 1e9)
@@ -87,12 +87,12 @@ def timed(work: Callable[[], object], seconds: float) -> dict[str, float]:
 
 
 def loop_latency(size: Size, rate_hz: float, seconds: float) -> Result:
-    """Latency of the loop of that size, and half a round trip of a bare echo of its messages; or `failure`, its reason.
+    """Latency of a loop of this size, and half the round trip of a bare echo of its messages; or the `failure`.
 
-    cpu is the processor time of the controller for each frame.
+    `cpu`: processor time of the controller for each frame.
     """
     try:
-        with watched() as moments, prepared_run(size, config := configuration(size, rate_hz)) as run:
+        with sampled_processes() as moments, prepared_run(size, config := configuration(size, rate_hz)) as run:
             (measured,) = run_repeats(LatencyOptions(config, seconds, 1), run, lambda _: None)
     except LowfcError as fault:
         return {"failure": str(fault)}
@@ -114,12 +114,12 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rate", type=float, default=RATE_HZ, help="frames per second of the loop (%(default)g)")
     parser.add_argument("--loop", action=argparse.BooleanOptionalAction, default=True, help="measure the loop too")
     for name, (sizes, _, what) in AXES.items():
-        known = f"{what}; without a number, this curve is left out (default: {' '.join(map(str, sizes))})"
-        parser.add_argument(f"--{name}", type=int, nargs="*", default=sizes, metavar="N", help=known)
+        text = f"{what}; without a number, this curve is left out (default: {' '.join(map(str, sizes))})"
+        parser.add_argument(f"--{name}", type=int, nargs="*", default=sizes, metavar="N", help=text)
 
 
 def measure(options: argparse.Namespace, report: Report) -> Result:
-    """Measure every point of every curve once in each repeat; rate_hz is None without the loop."""
+    """Measure every point of every curve once in each repeat; `rate_hz` is None if the loop is not measured."""
     curves = {name: [Size(**{field: n}) for n in getattr(options, name)] for name, (_, field, _) in AXES.items()}
     sizes = list(dict.fromkeys(size for curve in curves.values() for size in curve))
     if not sizes:
@@ -227,8 +227,8 @@ def about(result: Result) -> str:
         f"Medians over {result['repeats']} repeats of {result['seconds']:g} s each; in brackets the range "
         f"of p50. Sizes that a table does not vary: {default.pixels} pixels, {default.modes} modes, "
         f"{default.actuators} actuators. The step: one thread, back to back, normal scheduling, warm caches. The "
-        "memory limit: one read of as many bytes as a step must touch, by a float32 dot product of one half with the "
-        "other. "
+        "memory limit: one read of as many bytes as a step must touch, by a float32 dot product of their first half "
+        "with their second. "
         f"{loops}{failed}"
     )
 
@@ -241,7 +241,7 @@ _DRAWN = (
     ("step_us", "p50", "control step", "#0072B2", "s", "-"),
     ("step_us", "cpu", "step's processor time", "#56B4E9", "D", "--"),
     ("products_us", "p50", "two matrix-vector products", "#009E73", "x", "-."),
-    ("stream_us", "p50", "memory limit: its bytes read once", "#000000", "", ":"),
+    ("stream_us", "p50", "memory limit: the step's bytes read once", "#000000", "", ":"),
 )
 
 
@@ -256,10 +256,10 @@ def picture(result: Result) -> bytes:
     lines: dict[str, Any] = {}
     for panel, (name, points) in zip(panels, drawn.items(), strict=True):
         for kind, at, label, color, mark, dash in _DRAWN:
-            known = [(one[name], one[kind][at]) for one in points if at in one.get(kind, {})]
-            if known:
+            drawn_points = [(one[name], one[kind][at]) for one in points if at in one.get(kind, {})]
+            if drawn_points:
                 style = {"color": color, "marker": mark, "linestyle": dash, "markersize": 5}
-                (lines[label],) = panel.plot(*zip(*known, strict=True), **style)
+                (lines[label],) = panel.plot(*zip(*drawn_points, strict=True), **style)
         others = ", ".join(f"{getattr(default, other)} {other}" for other in AXES if other != name)
         panel.set(xscale="log", yscale="log", xlabel=f"{name} (number)", title=others)
         panel.grid(visible=True, which="both", linewidth=0.3)

@@ -27,7 +27,7 @@ MODULES = {
 LOOP = {"camera", "controller", "mirror"}
 
 _EVERY_S = 0.2
-_FRACTION = 0.8  # the use is averaged over this last part of the duration
+_FRACTION = 0.8  # the use of processors is averaged over this last fraction of the duration
 _START_S, _TIMEOUT_RATIO = 60.0, 12.0
 
 
@@ -47,8 +47,8 @@ class Moment(NamedTuple):
 
 
 @contextlib.contextmanager
-def watched() -> Iterator[list[Moment]]:
-    """Sample the child processes five times a second within a `with` block; see `shares`."""
+def sampled_processes() -> Iterator[list[Moment]]:
+    """Sample the child processes five times a second within a `with` block; `shares` evaluates the samples."""
     moments: list[Moment] = []
     ended = threading.Event()
 
@@ -104,13 +104,16 @@ def role_of(arguments: Sequence[str]) -> str | None:
 
 
 def run_lowfc(arguments: Sequence[str], seconds: float) -> dict[str, Any]:
-    """JSON of `lowfc` with these arguments, and usage (`shares`); or failure: its last stderr line, or the timeout."""
+    """JSON output of `lowfc` with these arguments, and `usage` by `shares`.
+
+    `failure` replaces both if the command fails: the last line of its standard error, or the timeout.
+    """
     command = [sys.executable, "-P", "-m", "lowfc", *arguments, "--duration", f"{seconds:g}", "--json"]
     timeout_s = _START_S + _TIMEOUT_RATIO * seconds
-    with tempfile.TemporaryDirectory() as folder, watched() as moments:
+    with tempfile.TemporaryDirectory() as folder, sampled_processes() as moments:
         where: dict[str, Any] = {"cwd": folder, "env": os.environ | {"XDG_RUNTIME_DIR": folder}}
         try:
-            done = subprocess.run(  # noqa: S603  # our own
+            done = subprocess.run(  # noqa: S603  # lowfc itself
                 command, **where, capture_output=True, text=True, timeout=timeout_s, check=False
             )
         except subprocess.TimeoutExpired:

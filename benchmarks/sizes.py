@@ -52,12 +52,12 @@ class Size:
 
     @property
     def bytes(self) -> int:
-        """Bytes that a step reads: the uint16 frame; in float32 R, reference, dark, mask and the modes' shapes."""
+        """Bytes that a step reads: the frame as uint16; R, reference, dark, mask and the modes' shapes as float32."""
         return 4 * self.pixels * (self.modes + 3) + 2 * self.pixels + 4 * self.modes * self.actuators
 
 
 def configuration(size: Size, rate_hz: float, **realtime: Any) -> Configuration:
-    """Configuration of a loop with a mirror of that size; keys of [realtime] as given."""
+    """Configuration of a loop with a mirror of this size; `realtime` sets keys of the table [realtime]."""
     overrides = {
         "camera.rate_hz": rate_hz,
         "mirror.rows": size.mirror_side,
@@ -100,7 +100,7 @@ def random_calibration(size: Size, config: Configuration) -> tuple[Calibration, 
 
 
 def prepared_run(size: Size, config: Configuration) -> AbstractContextManager[Run]:
-    """A run of that size with the files of its processes; the run is removed afterwards."""
+    """A run of a loop of this size, with the files that its processes read; the run is removed afterwards."""
 
     def fill(config: Configuration, run: Run) -> None:
         calibration, frames = random_calibration(size, config)

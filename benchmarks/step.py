@@ -108,10 +108,10 @@ def tables(found: Result) -> list[Lines]:
 
 def about(found: Result) -> str:
     """The step relative to one product, and its memory."""
-    over, memory, size = found["over_product"], found["memory"], Size()
+    ratios, memory, size = found["over_product"], found["memory"], Size()
     return (
-        f"The step takes {over['hot_us']:.1f} times as long as one product back to back, "
-        f"{over['paced_us']:.1f} times at {found['rate_hz']:g} Hz. {size.pixels} pixels, {size.modes} modes, "
+        f"The step takes {ratios['hot_us']:.1f} times as long as one product back to back, "
+        f"{ratios['paced_us']:.1f} times at {found['rate_hz']:g} Hz. {size.pixels} pixels, {size.modes} modes, "
         f"{size.actuators} actuators. A step's allocations reach {memory['peak_bytes'] / 1e3:.1f} kB at most "
         f"(a frame in float32 is {memory['frame_bytes'] / 1e3:.1f} kB); each step retains {memory['kept_bytes']:.1f} "
         "bytes."

@@ -1,9 +1,9 @@
 """The highest rate that the closed loop sustains, and the processor time of its processes there.
 
-A rate is sustained if at most one frame in a thousand is without a command, the recorder loses no message, and the
-frame rate is within 1 % of the requested one, in two of up to three runs. The highest such rate of a geometric grid is
-found by bisection. `lowfc latency` runs the loops. Its results leave out the first half second, but the counts of lost
-messages and late commands include it.
+A run sustains a rate if at most one frame in a thousand is without a command, the recorder loses no message, and the
+frame rate is within 1 % of the requested one. A rate is sustained if two of up to three runs sustain it. The highest
+such rate of a geometric grid is found by bisection. `lowfc latency` runs the loops. Its results leave out the first
+half second, but the counts of lost messages and late commands include it.
 
 Example:
     python -m benchmarks throughput

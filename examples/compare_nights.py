@@ -18,16 +18,16 @@ def report(log: str) -> dict[str, Any]:
 
 
 def rows(nights: list[dict[str, Any]]) -> dict[str, list[str]]:
-    """Return the lines by name, each with one text for every night."""
+    """Return the text of every night, by the name of the quantity."""
     found: dict[str, list[str]] = {}
-    for place, night in enumerate(nights):
+    for index, night in enumerate(nights):
         texts = {"verdict": night["verdict"]["heading"]}
         texts |= {check["name"]: check["text"] for check in night["verdict"]["checks"]}
         for mode in night["residual"]["modes"]:
             residual_nm = mode["residual_rms_nm"] if mode["residual_rms_nm"] is not None else mode["error_rms_nm"]
             texts[f"Z{mode['noll']} {mode['name']}, nm"] = "-" if residual_nm is None else f"{residual_nm:.2f}"
         for name, text in texts.items():
-            found.setdefault(name, ["-"] * len(nights))[place] = text
+            found.setdefault(name, ["-"] * len(nights))[index] = text
     return found
 
 

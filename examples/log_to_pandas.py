@@ -22,9 +22,9 @@ def table(path: Path) -> pd.DataFrame:
     if calibration is None:
         raise SystemExit(f"{path} has no calibration: are these all files of the recording?")
     columns = {
-        f"{name}_z{noll}_nm": values[:, place]
+        f"{name}_z{noll}_nm": values[:, index]
         for name, values in (("error", steps.error_nm), ("pol", steps.pol_nm), ("command", steps.command_nm))
-        for place, noll in enumerate(calibration.noll)
+        for index, noll in enumerate(calibration.noll)
     }
     flux_dn = np.where(np.isfinite(steps.error_nm).all(axis=1), steps.flux_dn, np.nan)  # 0 for a refused frame
     time = pd.to_datetime(steps.time_ns, unit="ns", utc=True)

@@ -68,13 +68,13 @@ ADVICE: dict[str, tuple[str, str]] = {
         "change those channels, then `lowfc ctl channel flat FILE`.",
     ),
     "LAW_NOT_IN_FORCE": (
-        "the law of `control.law` was refused: no calibration of its modes is loaded, or the camera does not fit the "
-        "calibration.",
+        "the law of `control.law` was refused: no calibration of the law's modes is loaded, or the camera's settings "
+        "do not fit the calibration.",
         "load a calibration of these modes for the camera's settings, or restore the camera's settings; then "
         "`lowfc ctl law FILE`.",
     ),
     "LAW_OVERRULED": (
-        "the guard found that the law's residual exceeds the integrator's, or that the loop amplifies.",
+        "the guard found that the law's residual exceeds the integrator's, or that the loop amplifies the disturbance.",
         "tune a law again from a recent log; `lowfc ctl law FILE`, or `open` and then `close`, reactivates it.",
     ),
     "LAW_BACK": (
@@ -211,7 +211,8 @@ REASONS: dict[str, tuple[str, str]] = {
     ),
     "REPEATED": ("the newest frame arrived again", "nothing, unless frequent"),
     "LATE": (
-        "the frame is older than `control.max_frame_age_ms`, or than both 5 ms and three periods; or it was superseded",
+        "the frame's age is above `control.max_frame_age_ms`, or above both 5 ms and three periods; or a newer frame "
+        "superseded it",
         "`lowfc doctor`; check the clocks of the hosts",
     ),
     "SATURATED": ("more than `control.max_saturated_pixels` pixels are at full well", "shorter exposure, lower gain"),

@@ -1,6 +1,6 @@
 """Make the pictures of docs/howto/console.md: `python -m tools.measure console`, about two minutes.
 
-Real processes are brought into each state, and a console without a terminal draws them.
+Real processes are brought into each state, and a console without a terminal draws the picture.
 """
 
 import asyncio

@@ -18,7 +18,7 @@ _OMEGA = 2 * np.pi * np.array(LINES_HZ) / RATE_HZ
 _NO_WIDTH_HZ, _NO_NOISE_NM2, _NO_DRIFT_NM2 = 1e-6, 1e-6, 1e-9
 _LINES = tuple(Line(hz, _NO_WIDTH_HZ, mas**2) for hz, mas in zip(LINES_HZ, LINES_MAS, strict=True))
 WHEEL = Model(_NO_DRIFT_NM2, np.inf, _LINES, _NO_NOISE_NM2, RATE_HZ)
-"""The five lines alone; its nm are mas."""
+"""Model of the five lines alone; where a model has nm, this one has mas."""
 _CASES = (Timing.of(1, 0.5), Timing.of(1, 0.9), Timing.of(2, 0.5))
 
 
@@ -47,13 +47,13 @@ def table() -> str:
 
 
 def kalman(timing: Timing, start: float, length: float) -> LinearLaw:
-    """Kalman filter of the exact lines; its command nulls the mean over [start, start + length] periods."""
+    """Kalman filter with the exact lines; its command nulls the mean error over [start, start + length] periods."""
     predicted_mean = WHEEL.mean_over(start, length) @ np.linalg.inv(WHEEL.mean_over(0.0, timing.exposure))
     return replace(lqg([WHEEL], (2,), timing), output=(-WHEEL.states()[2] @ predicted_mean)[None].astype(np.float32))
 
 
 def floor_mas() -> float:
-    """Least residual of a command that is held for a period, mas rms."""
+    """Least residual that a command held for a period can leave, mas rms."""
     return float(np.sqrt(np.square(LINES_MAS) @ hold_floor(_OMEGA)))
 
 

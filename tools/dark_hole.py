@@ -22,8 +22,8 @@ def measure() -> Results:
             result = dark_hole(Path(folder), step_rms_nm)
         run: Results = {"together_nm": step_rms_nm * STEPS**0.5}
         for name, channel in result.channels.items():
-            undone, error = channel.undone()
-            run[name] = {"undone": undone, "error": error, "left_nm": channel.residual_nm.tolist()}
+            undone_fraction, error = channel.undone()
+            run[name] = {"undone": undone_fraction, "error": error, "left_nm": channel.residual_nm.tolist()}
         run["seen_nm"] = float(np.linalg.norm(result.channels[SHIFTED].channel_nm[-1]))
         runs[f"{step_rms_nm:g}"] = run
     return {"runs": runs}
@@ -38,19 +38,19 @@ def render(results: Results) -> str:
     )
     rows = [
         (
-            each,
+            step_rms_nm,
             f"{run['together_nm']:.1f}",
             f"{run['seen_nm']:.1f}",
             *(f"{100 * run[name]['undone']:.2f} +- {100 * run[name]['error']:.2f}" for name in (SHIFTED, PLAIN)),
             " -> ".join(f"{left:.2f}" for left in run[SHIFTED]["left_nm"]),
         )
-        for each, run in results["runs"].items()
+        for step_rms_nm, run in results["runs"].items()
     ]
     return (
         f"{markdown(head, rows)}\n{STEPS} random steps, {SETTLE} frames apart, each added to those before it; "
         f"without the shift, {STEPS_COMBINED} steps are added at a time. Undone: the fraction of the channel's shape, "
-        "as seen by the sensor, that the loop removes. It is the slope of (command + disturbance) against the "
-        "channel's modes, sign reversed; least squares over all steps and modes, with its standard error. A negative "
+        "as seen by the sensor, that the loop removes. It is minus the slope of (command + disturbance) against the "
+        "channel's modes, by least squares over all steps and modes, with its standard error. A negative "
         "value means that the loop adds to the steps. The true residual is the rms of all modes about their mean, over "
         "the full circle, before the first step and after the last."
     )

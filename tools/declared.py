@@ -164,10 +164,10 @@ def fields(message: str) -> str:
     }
     index = [one.name for one in file.message_type].index(message)
     rows = []
-    for place, field in enumerate(file.message_type[index].field):
+    for number, field in enumerate(file.message_type[index].field):
         kind = field.type_name.rpartition(".")[2] or type(field).Type.Name(field.type).removeprefix("TYPE_").lower()
         repeated = "repeated " if field.label == type(field).LABEL_REPEATED else ""
-        comment = comments.get((_MESSAGES, index, _FIELDS, place)) or _UNCOMMENTED[field.name]
+        comment = comments.get((_MESSAGES, index, _FIELDS, number)) or _UNCOMMENTED[field.name]
         rows.append((f"`{field.name}`", repeated + kind, field.number, comment))
     return markdown(("field", "type", "number", "description"), rows)
 

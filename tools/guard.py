@@ -116,7 +116,7 @@ def measure() -> Results:
 
 
 def cost_us(law: LinearLaw) -> dict[str, float]:
-    """Least time, us, that the guard adds to a frame while the law drives, and while it is overruled."""
+    """Least time, us, that the guard adds to a frame while the law drives, and while the law is overruled."""
     modes = len(law.noll)
     zeros, value_nm = np.zeros(modes, np.float32), np.ones(modes, np.float32)
     integrator_and_history = (
@@ -179,7 +179,8 @@ def render(results: Results) -> str:
         f"identified from {_IDENTIFY / RATE_HZ:g} s of the closed loop; the integrator has the best gains for the same "
         f"frames. Without a shift, in runs of {results['minutes']:g} minutes with unmodelled steps of "
         f"{2 * AMPLITUDE_MAS:g} mas every 2 s, laws were overruled: {good}.{partly} With a law of 14 modes the guard "
-        f"adds {cost['driving']:.1f} us to a frame while the law drives, {cost['virtual']:.1f} us while it does not. "
+        f"adds {cost['driving']:.1f} us to a frame while the law drives, {cost['virtual']:.1f} us while it is "
+        "overruled. "
         "The live loop's own `advance` receives modes whose noise has the covariance of image noise after R; no images "
         "are simulated."
     )

@@ -90,7 +90,7 @@ class Bench:
         Args:
             config: configuration of the controller.
             first: first input: a calibration, or another input.
-            disturbance: replaces the configuration's.
+            disturbance: replaces the disturbance of the configuration.
             world: configuration of optics, detector and mirror, if it differs from `config`.
         """
         self._begin(config, Load(0, first, "bench") if isinstance(first, Calibration) else first)
@@ -135,7 +135,7 @@ class Bench:
         self.new_record()
 
     def expose(self) -> tuple[Single, Pixels]:
-        """Expose; the mirror's shape (rows, columns) in the exposure, and the frame."""
+        """Expose a frame; return the mirror's shape (rows, columns) in the exposure, nm of surface, and the pixels."""
         self._shapes = [self._status.surface_nm, *self._shapes[:-1]]
         single = len(self._weights) == 1
         exposed_nm = self._shapes[0] if single else np.tensordot(self._weights, np.array(self._shapes), 1)

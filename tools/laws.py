@@ -38,9 +38,9 @@ SHORTER = (8_000, 16_000)
 IDENTIFY, SETTLE, MEASURE = 48_000, 12_000, 12_000
 """Frames of the closed loop: for identification of a law, for settling, for the measurement."""
 _DRIFT_BOUNDS = ((-5.0, 2.0), (-1.0, 4.0))
-"""Bounds of the search for the optimum: log10 of the walk's step, nm^2, and of its corner, Hz.
+"""Bounds of the search for the optimum: log10 of the random walk's step, nm^2, and of its low-pass corner, Hz.
 
-The highest corners are far above half the frame rate: there the walk has no low-pass, and the optimum may be there.
+The highest corners are far above half the frame rate, where the low-pass has no effect; the optimum may be there.
 """
 
 
@@ -99,7 +99,7 @@ def moved_lines_mas(config: Configuration, calibration: Calibration, law: Linear
 
 
 def theory_mas(config: Configuration, calibration: Calibration, law: LinearLaw) -> tuple[float, float]:
-    """Continuous-time tilt residual of the disturbance's known spectrum, and the noise part, mas rms per axis."""
+    """Theoretical tilt residual, mas rms per axis, in continuous time: the disturbance's part, and the noise's part."""
     frequency_hz, variance_nm2 = variances_nm2(disturbance_of(config))
     passed = residual_power(law, 2 * np.pi * frequency_hz / config.camera.rate_hz, timing_of(config))[:, :2]
     disturbance_nm2 = np.mean(np.sum(variance_nm2[:, :2] * passed, axis=0))
@@ -109,7 +109,7 @@ def theory_mas(config: Configuration, calibration: Calibration, law: LinearLaw) 
 
 
 def tilt_residual_mas(config: Configuration) -> float:
-    """Predicted rms tilt residual per axis of the integrator; from a linear model, valid for residuals of a few mas.
+    """Predicted tilt residual of the integrator, mas rms per axis, by a linear model for residuals of a few mas.
 
     The spectrum of sine waves, damped lines and wheels is known; a square wave and a static wavefront are left out.
     Photon and read noise propagate through R. For an automatic gain, the highest gain within the margins is used.
@@ -125,7 +125,7 @@ def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool
 
     Args:
         config: the loop.
-        calibration: that of the loop, for the noise of a frame.
+        calibration: calibration of the loop, for the noise of a frame.
         robust: keep the margins that `lowfc tune` requires.
 
     Raises:
@@ -152,8 +152,8 @@ def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool
             return float(power @ passed + variance * noise_gain(law, timing.delay)[0])
 
         minimum = minimize(residual, (-2.0, 0.7), method="Nelder-Mead", bounds=_DRIFT_BOUNDS, options={"xatol": 0.02})
-        (step, corner), ((least, most), (lowest, _)) = minimum.x, _DRIFT_BOUNDS
-        if min(step - least, most - step, corner - lowest) < 0.05:
+        (step, corner), ((lowest_step, highest_step), (lowest_corner, _)) = minimum.x, _DRIFT_BOUNDS
+        if min(step - lowest_step, highest_step - step, corner - lowest_corner) < 0.05:
             raise RuntimeError(f"no minimum within {_DRIFT_BOUNDS}: ended at {minimum.x}")
         return float(minimum.fun)
 

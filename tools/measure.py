@@ -141,11 +141,11 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     makers = {"pictures": pictures.make, "console": console.make, "layouts": layouts.make}
-    known = (*MEASUREMENTS, *makers)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"any of {', '.join(known)}")
+    choices = (*MEASUREMENTS, *makers)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"any of {', '.join(choices)}")
     names = parser.parse_args().names
-    if unknown := [name for name in names if name not in known]:
-        parser.error(f"there is no {unknown[0]!r}; there are {', '.join(known)}")
+    if unknown := [name for name in names if name not in choices]:
+        parser.error(f"there is no {unknown[0]!r}; there are {', '.join(choices)}")
     for name in names:
         if name in makers:
             makers[name]()

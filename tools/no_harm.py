@@ -29,7 +29,7 @@ TOLERATED = 0.01
 """Tolerated added contrast as a fraction of the dark zone's own, in addition to three standard errors."""
 RATE_HZ, SECONDS = 250.0, 20.0
 GAINS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.1)
-_HALF = int(RATE_HZ * SECONDS / 2)
+_HALF_FRAMES = int(RATE_HZ * SECONDS / 2)
 _AUTO = {"control.tilt_gain": "auto", "control.gain": "auto"}
 
 
@@ -62,8 +62,8 @@ def _open_nm2(preset: str, seed: int) -> Array:
 
 
 def _residual_nm2(bench: ModalBench) -> Array:
-    bench.run(_HALF, record=False)
-    bench.run(_HALF)
+    bench.run(_HALF_FRAMES, record=False)
+    bench.run(_HALF_FRAMES)
     return np.asarray(np.square(bench.residual_nm()).mean(axis=0))
 
 
@@ -97,7 +97,7 @@ def modal_case(case: tuple[str, str, float]) -> Results:
             ]
         )
         best = fixed[:, :2].sum(axis=1).min() + fixed[:, 2:].sum(axis=1).min()  # tip and tilt; other modes
-        row["of_best"] = float(np.sqrt(residual_nm2[: len(seeds)].sum(axis=1).mean() / best))
+        row["ratio_to_best_gains"] = float(np.sqrt(residual_nm2[: len(seeds)].sum(axis=1).mean() / best))
     return row
 
 
@@ -108,8 +108,8 @@ def imaged_case(case: tuple[str, str, float]) -> Results:
     residual_nm2, disturbance_nm2 = list[Array](), list[Array]()
     for seed in SEEDS:
         bench = Bench(_configured(sensor, preset, magnitude, seed, _AUTO), calibration)
-        bench.run(2 * _HALF)
-        truths = [truth.continuous for truth in bench.truths[-_HALF:]]
+        bench.run(2 * _HALF_FRAMES)
+        truths = [truth.continuous for truth in bench.truths[-_HALF_FRAMES:]]
         for name, means in (("residual_nm", residual_nm2), ("disturbance_nm", disturbance_nm2)):
             modes_nm = np.array([getattr(truth, name) for truth in truths], float)
             means.append(np.square(modes_nm).mean(axis=0))
@@ -156,16 +156,16 @@ def render(results: Results) -> str:
     modal = [row for row in rows if "images" not in row]
     table = []
     for sensor, magnitude in dict.fromkeys((row["sensor"], row["magnitude"]) for row in modal):
-        mine = {row["preset"]: row for row in modal if (row["sensor"], row["magnitude"]) == (sensor, magnitude)}
+        by_preset = {row["preset"]: row for row in modal if (row["sensor"], row["magnitude"]) == (sensor, magnitude)}
         if magnitude in SHOWN:
             table.append(
                 {"sensor": sensor, "magnitude": magnitude}
-                | {preset: "{open_nm:.2f} -> {closed_nm:.2f}".format(**row) for preset, row in mine.items()}
+                | {preset: "{open_nm:.2f} -> {closed_nm:.2f}".format(**row) for preset, row in by_preset.items()}
             )
     harmful, saturated = [row for row in rows if harms(row)], len(results["rows"]) - len(rows)
     stars = _magnitudes(modal)
-    bright = [row for row in rows if "of_best" in row]
-    compared = [row["of_best"] for row in bright]
+    bright = [row for row in rows if "ratio_to_best_gains" in row]
+    ratios = [row["ratio_to_best_gains"] for row in bright]
     names = "; ".join(
         "{sensor}, {preset}, V = {magnitude}: {added:.2g}".format(**row, added=row["change"] / row["own"])
         for row in harmful
@@ -183,7 +183,7 @@ def render(results: Results) -> str:
         f"{100 * TOLERATED:g} % of the dark zone's own plus three standard errors (`quiet`: {100 * TOLERATED:g} % "
         f"alone). Harmful cases, with the ratio of added contrast to the dark zone's own: {names or 'none'}. On bright "
         f"stars (V = {_magnitudes(bright)}; without `quiet`; two seeds) the residual with automatic gains is "
-        f"{min(compared):.2f} to {max(compared):.2f} times that of the best fixed gains, chosen afterwards."
+        f"{min(ratios):.2f} to {max(ratios):.2f} times the residual with the best fixed gains, chosen afterwards."
     )
 
 

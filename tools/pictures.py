@@ -1,7 +1,7 @@
 """Make the pictures of docs/howto/viewing.md and the README: `python -m tools.measure pictures`, about three minutes.
 
 Real processes are brought into each state, and `lowfc view --headless-screenshot` takes the picture.
-Needs a Vulkan driver: `apt install mesa-vulkan-drivers libvulkan1`.
+A Vulkan driver is needed: `apt install mesa-vulkan-drivers libvulkan1`.
 """
 
 import contextlib
@@ -32,11 +32,11 @@ BRIGHT = {"control.start_mode": "closed", "sensor.sam": "sam27d10_bal14"}
 SMALL_WELL = {"control.start_mode": "closed", "camera.full_well_e": 1500.0}
 
 
-def picture(name: str, source: str, *more: str, meanwhile: Callable[[], object] | None = None) -> None:
+def picture(name: str, source: str, *options: str, meanwhile: Callable[[], object] | None = None) -> None:
     """Take a picture of a run or a log while `meanwhile` runs, and store it in the documentation."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / f"{name}.png"
-        command = [sys.executable, "-m", "lowfc", "view", *source.split(), "--headless-screenshot", str(out), *more]
+        command = [sys.executable, "-m", "lowfc", "view", *source.split(), "--headless-screenshot", str(out), *options]
         view = subprocess.Popen(command)
         if meanwhile is not None:
             time.sleep(LOOK_S * 0.55)

@@ -1,4 +1,4 @@
-"""Shared by the measurements: description of the host, JSON of a command, tables in Markdown."""
+"""Functions shared by the measurements: description of the host, JSON of a command, tables in Markdown."""
 
 import json
 import os
@@ -18,12 +18,12 @@ Results = dict[str, Any]
 
 def host() -> dict[str, Any]:
     """Properties of the host that the results depend on."""
-    known = provenance()
+    properties = provenance()
     return {
-        "processor": known["processor"],
-        "processors": int(known["processors"]),
-        "kernel": known["kernel"],
-        "python": known["python"],
+        "processor": properties["processor"],
+        "processors": int(properties["processors"]),
+        "kernel": properties["kernel"],
+        "python": properties["python"],
         "virtual": "hypervisor" in Path("/proc/cpuinfo").read_text(),
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
         "load_before": round(os.getloadavg()[0], 2),
@@ -64,8 +64,8 @@ def formatted_table(formats: dict[str, str], rows: Iterable[Results]) -> str:
 def provenance_text(name: str, results: Results) -> str:
     """Date, host and commands of a measurement, as a sentence."""
     about = results["host"]
-    *most, last = [f"`{command}`" for command in results["commands"]] or [""]
-    runs = f", which runs {', '.join(most)}{' and ' if most else ''}{last}" if last else ""
+    *first, last = [f"`{command}`" for command in results["commands"]] or [""]
+    runs = f", which runs {', '.join(first)}{' and ' if first else ''}{last}" if last else ""
     return f"Measured {host_in_words(about)} by `python -m tools.measure {name}`{runs}."
 
 

@@ -34,7 +34,7 @@ KEYS: dict[str, Any] = {
 def measure() -> Results:
     """Results of every case."""
     configurations = {
-        f"{part:g}": configured(**KEYS | {"camera.exposure_fraction": part}) for part in EXPOSURE_FRACTIONS
+        f"{fraction:g}": configured(**KEYS | {"camera.exposure_fraction": fraction}) for fraction in EXPOSURE_FRACTIONS
     }
     with threadpool_limits(1):
         return {"cases": {name: case(config) for name, config in configurations.items()}}
@@ -71,8 +71,8 @@ def case(config: Configuration) -> Results:
         "tilt_gain": config.control.tilt_gain,
         "frames_refused": bench.frames_refused,
         "modes": {
-            f"{noll} {mode_name(noll)}": {name: float(values[place]) for name, values in columns.items()}
-            for place, noll in enumerate(config.noll)
+            f"{noll} {mode_name(noll)}": {name: float(values[index]) for name, values in columns.items()}
+            for index, noll in enumerate(config.noll)
         },
     }
 

@@ -21,7 +21,7 @@ def render(measured: Callable[[str], Results]) -> str:
 
 
 def _row(quantity: str, limit: float, values: Sequence[float], form: str, bound: str, excess: str) -> Row:
-    """Row of a quantity with one value for each turn; `bound` holds for any such program; `excess`: work above it."""
+    """Row of a quantity with one value for each turn; `bound` of any such program; `excess`: work beyond the bound."""
     reached, shown = median(values), form.format
     spread = f" ({shown(min(values))} to {shown(max(values))})" if len(values) > 1 else ""
     met = "yes" if reached <= limit else "no" if shown(reached) != shown(limit) else f"no: {reached:.5g}"
@@ -43,13 +43,13 @@ def _comparison(results: Results) -> Iterator[Row]:
     runs = results["runs"]
     shared = "the parts common to both: transport of the frame, wake-up, transport of the command"
     for at, limit in (("p50", 0.72), ("p99", 0.75)):
-        ratios = [mine[at] / its[at] for mine, its in pairs(runs, NUMPY)]
+        ratios = [fused[at] / numpy[at] for fused, numpy in pairs(runs, NUMPY)]
         yield _row(f"frame to command, ratio fused / numpy, {at}", limit, ratios, "{:.2f}", shared, OBJECTS)
     sockets = "sockets wake two Python processes"
     ways = f"{sockets}; the C chain waits on semaphores in shared memory"
     for other, targets in (("C chain", {"p50": 40.0, "p99": 80.0}), ("pyrtcao, fused", {"p50": 0.0, "p99": 0.0})):
         for at, limit in targets.items():
-            differences = [mine[at] - its[at] for mine, its in pairs(runs, other)]
+            differences = [fused[at] - compared[at] for fused, compared in pairs(runs, other)]
             quantity = f"frame to command, lowfc minus {other.replace(',', '')}, {at}, us"
             excess = ways if other == "C chain" else f"{sockets}; also checks, limits and messages that pyrtcao lacks"
             yield _row(quantity, limit, differences, "{:+.0f}", "0 for the same work in C", excess)

@@ -20,7 +20,7 @@
 #include "ImageStreamIO.h"
 
 enum { ROWS = 4 }; /* rows of the product that are summed in parallel */
-_Static_assert(MODES % ROWS == 0, "rows are taken four at a time");
+_Static_assert(MODES % ROWS == 0, "MODES must be a multiple of ROWS");
 
 static const uint16_t *frames;
 static const float *I0, *R, *to_actuators;

@@ -61,7 +61,7 @@ DEFINITIONS = {
     "after the zenoh put, or after pyrtcao's write_stream; for lowfc after the direct link's send, before zenoh's",
     "frame to command": "from t0 to t1",
     "frame to mirror": "from t0 until the mirror's process has received the actuator values; for lowfc until just "
-    "before it publishes its state",
+    "before the mirror publishes its state",
     "clock": "CLOCK_MONOTONIC, one host",
     "pacing": "the source sleeps until absolute times; a late frame is sent at once, and its t0 is the actual time of "
     "sending; no frame is skipped",
@@ -70,7 +70,7 @@ DEFINITIONS = {
     "frames without a command": "measured frames that led to no command, in all turns",
     "pinning": "source and mirror on the first processor, all else on the second; with three or more processors "
     "lowfc's mirror on the third",
-    "memory": "lowfc's processes lock theirs (`realtime.lock_memory`), the others do not",
+    "memory": "lowfc's processes lock their memory (`realtime.lock_memory`), the other implementations' do not",
     "threads": "BLAS and numba 1; garbage collection off everywhere",
     "compiler": "the C implementation (chain.c) is built with cc -O3 -march=native -ffast-math",
 }
@@ -85,7 +85,7 @@ def options(parser: argparse.ArgumentParser) -> None:
         "--only",
         action="append",
         metavar="WORD",
-        help="implementations with this in their name; the option may be repeated",
+        help="run only the implementations whose name contains WORD; the option may be repeated",
     )
     isio = os.environ.get("ISIO_DIR")
     parser.add_argument(
@@ -98,7 +98,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, report: Report) -> Result:
-    """Run all implementations in turns: statistics of each turn (None if it failed), and why one is missing."""
+    """Run all implementations in turns: statistics of each run (None if it failed), and why any is missing."""
     chosen = [one for one in IMPLEMENTATIONS if any(word in one.name for word in options.only or [""])]
     if not chosen:
         raise ConfigurationError(f"--only: none of {'; '.join(one.name for one in IMPLEMENTATIONS)}")
@@ -160,8 +160,8 @@ def one_run(implementation: Implementation, options: argparse.Namespace, priorit
 def run_statistics(folder: Path, warm_up: int) -> dict[str, Any]:
     """Statistics of a run without its first `warm_up` frames; percentiles in us, None without any command.
 
-    command_error: largest difference between the actuator values of the last command and those of numpy, relative
-    to the largest of these; None if a command is missing.
+    command_error: largest difference between the actuator values of the last command and numpy's values, relative to
+    numpy's largest value; None if a command is missing.
     """
     due, published, commanded, received = (np.fromfile(folder / name, np.int64)[1:] for name in TIME_STAMPS)
     command_error = _command_error(folder, commanded.size) if commanded.all() and received[-1] else None
@@ -300,19 +300,21 @@ def _cells(name: str, turns: Sequence[Result | None], is_missing: bool) -> list[
 
 
 def _spans(turns: Sequence[Result], span: str, names: Iterable[str]) -> list[str]:
-    known = [turn[span] for turn in turns if turn[span] is not None]
-    return [ranged([one[at] for one in known], "{:.0f}".format) if known else "" for at in names]
+    measured = [turn[span] for turn in turns if turn[span] is not None]
+    return [ranged([one[at] for one in measured], "{:.0f}".format) if measured else "" for at in names]
 
 
 def pairs(runs: Result, other: str) -> list[tuple[Result, Result]]:
     """Percentiles from frame to command of lowfc's fused step and of another implementation, by turn."""
     turns = zip(runs.get(FUSED, ()), runs[other], strict=False)
-    return [(mine["frame_to_command"], its["frame_to_command"]) for mine, its in turns if mine and its]
+    return [
+        (fused["frame_to_command"], compared["frame_to_command"]) for fused, compared in turns if fused and compared
+    ]
 
 
 def _difference(runs: Result, other: str) -> list[str]:
     both = pairs(runs, other)
-    each = [[mine[at] - its[at] for mine, its in both] for at in ("p50", "p99")]
+    each = [[fused[at] - compared[at] for fused, compared in both] for at in ("p50", "p99")]
     ahead = [f"{sum(one < 0 for one in differences)} of {len(both)}" for differences in each]
     return [other, *(ranged(differences, "{:+.0f}".format) for differences in each), *ahead]
 

@@ -53,7 +53,7 @@ def _pyrtcao(name: str, description: str, safety: str, *roles: str) -> Implement
 def _lowfc(kernel: str) -> Implementation:
     return Implementation(
         f"lowfc, {kernel}",
-        "its own controller and simulated mirror, with prepared frames of this comparison's size, by `lowfc latency`",
+        "its own controller and simulated mirror; `lowfc latency` runs them with the comparison's prepared frames",
         log="every frame, command, mirror state and step is published for a recorder; bit-exact replay",
         safety="late, dark, saturated and identical frames refused, missing ones bridged; limits of modal command, "
         "stroke, slew and difference of neighbours, the last three in the mirror too; command timeout",
