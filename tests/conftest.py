@@ -40,7 +40,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(optionalhook=True)  # without pytest-xdist: -p no:xdist
 def pytest_xdist_auto_num_workers() -> int:
-    """One more than processors: the worker with the exclusive tests mostly waits."""
+    """One worker more than processors, because the worker with the exclusive tests mostly waits."""
     return len(os.sched_getaffinity(0)) + 1
 
 

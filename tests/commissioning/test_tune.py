@@ -94,7 +94,7 @@ def test_the_true_residual_over_all_time_is_read_from_the_log(tmp_path: Path) ->
     night = SyntheticLog()
     night.instants = 4  # the residual over all time is then twice that at the start of the exposures
     night.request("close").frames(2100)
-    del night.samples[night.places(TRUTH)[1200]]  # as if it were lost
+    del night.samples[night.indices(TRUTH)[1200]]  # as if it were lost
     run = telemetry_from_log(LogReader(night.write(tmp_path / "night.mcap")))
     np.testing.assert_allclose(run.continuous_rms_nm, 2 * np.sqrt(np.diag(run.true_nm2)), rtol=1e-5)
 

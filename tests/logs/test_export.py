@@ -64,10 +64,10 @@ def a_night() -> SyntheticLog:
     night.request("leak", (0.0,))
     night.frames(STEPS // 2)
     for topic, number in ((COMMAND, WITHOUT_COMMAND), (TRUTH, WITHOUT_TRUTH)):
-        del night.samples[night.places(topic)[number]]
-    held = night.messages(COMMAND)[0]
-    held.actuators = bytes(4 * ACTUATORS)
-    night.put(COMMAND, held)  # a later command of the first frame
+        del night.samples[night.indices(topic)[number]]
+    second_command = night.messages(COMMAND)[0]
+    second_command.actuators = bytes(4 * ACTUATORS)
+    night.put(COMMAND, second_command)  # a later command of the first frame
     return night
 
 
@@ -75,11 +75,11 @@ NIGHT = a_night()
 STEPS_SENT = NIGHT.messages(STEP)
 SEQUENCES = [step.frame_sequence for step in STEPS_SENT]
 TIMES_NS = [from_timestamp(step.timestamp) for step in STEPS_SENT]
-FRAMES = np.array([decode_frame(NIGHT.samples[place].payload, 0, 0).pixels for place in NIGHT.places(FRAME)])
+FRAMES = np.array([decode_frame(NIGHT.samples[index].payload, 0, 0).pixels for index in NIGHT.indices(FRAME)])
 
 
 def sent(topic: Topic, name: str, width: int = MODES) -> Array:
-    """A quantity of each step, as float32; NaN if it was not sent."""
+    """Quantity `name` of the message of each step (steps, width), in its own unit; NaN if it was not sent."""
     rows = np.full((STEPS, width), np.nan, np.float32)
     for body in reversed(NIGHT.messages(topic)):
         value = getattr(body, name)
@@ -107,10 +107,10 @@ def test_a_csv_row_has_the_values_of_its_step(log: Path, tmp_path: Path) -> None
     assert (rows[0]["reasons"], rows[REFUSED]["reasons"]) == ("", "dark")
     assert rows[REFUSED]["error_z2_nm"] == rows[WITHOUT_TRUTH]["true_residual_rms_nm"] == ""
     assert float(rows[3]["transport_us"]) == 90
-    for place, noll in enumerate(toy.NOLL):
+    for index, noll in enumerate(toy.NOLL):
         for stem, topic, name in (("error", STEP, "error_nm"), ("true_disturbance", TRUTH, "disturbance_nm")):
             read = np.array([float(row[f"{stem}_z{noll}_nm"] or "nan") for row in rows], np.float32)
-            np.testing.assert_array_equal(read, sent(topic, name)[:, place])
+            np.testing.assert_array_equal(read, sent(topic, name)[:, index])
     table = Table.read(tmp_path / "out.csv")
     np.testing.assert_array_equal(np.array(table["command_z4_nm"], np.float32), sent(STEP, "command_nm")[:, 2])
 
@@ -234,7 +234,7 @@ def test_a_truncated_log_without_truth_and_with_an_accent_in_its_name_is_exporte
         assert "true" not in heading
 
 
-def test_damage_is_reported_with_its_place_and_reason(tmp_path: Path) -> None:
+def test_damage_is_reported_with_its_position_and_reason(tmp_path: Path) -> None:
     log = SyntheticLog().frames(800).write(tmp_path / "night.mcap")
     flipped(log, log.stat().st_size // 3)
     results = export_log(log, Format.NPZ, tmp_path / "out.npz", console=QUIET)
@@ -282,7 +282,7 @@ def test_a_failed_export_leaves_no_file(tmp_path: Path, to: Format, frame: Messa
 def test_a_log_replaced_during_its_export_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = NIGHT.write(tmp_path / "night.mcap")
     shorter = a_night()
-    del shorter.samples[shorter.places(FRAME)[-1]]
+    del shorter.samples[shorter.indices(FRAME)[-1]]
     replacement = shorter.write(tmp_path / "shorter.mcap")
 
     def copy_after_change(cube: Path, history: History) -> None:

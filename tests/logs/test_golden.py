@@ -41,7 +41,7 @@ LAW_ID = "15560553d408bce3394be8a5123a916a091b94f0a6f0d423cc89d546b4e967f3"
 def test_a_replay_is_identical_except_for_rules_that_changed_on_purpose(
     log: Path, lost_bytes: int, frames: int, changed: dict[str, int], tmp_path: Path
 ) -> None:
-    """Also without the beginning of the log, which names its version."""
+    """This holds also for a log without its beginning, which names the version of lowfc that wrote it."""
     path = tmp_path / "log.mcap"
     path.write_bytes(log.read_bytes()[lost_bytes:])
     # Linear algebra rounds differently on another processor; on the same one there must be no difference.
@@ -60,7 +60,7 @@ def test_the_golden_files_of_the_present_version_can_be_made_and_replayed(tmp_pa
     assert json_of("replay", folder / "night.mcap")["identical"]
 
 
-def test_another_blas_kernel_differs_only_by_rounding() -> None:
+def test_a_replay_with_another_blas_kernel_differs_only_by_rounding() -> None:
     command = [sys.executable, "-m", "lowfc", "replay", str(NIGHT), "--json", "--tolerance", "1e-3"]
     environment = os.environ | {"OPENBLAS_CORETYPE": "Prescott"}  # SSE3: every x86-64 processor has it
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)

@@ -42,7 +42,7 @@ def test_late_commands_after_a_restart_of_the_camera_are_counted(tmp_path: Path)
     assert history_of(night, tmp_path / "x.mcap").commands_late == 3 + 6  # 40 precede the log
 
 
-def test_the_camera_state_is_that_of_most_steps_and_steps_with_other_settings_are_marked(tmp_path: Path) -> None:
+def test_the_rate_is_that_of_most_steps_and_steps_at_another_rate_are_marked(tmp_path: Path) -> None:
     night = SyntheticLog().frames(STEPS)
     settings = night.messages(CAMERA_STATE)[0]
     for factor, frames in ((2, 5), (1, 5)):
@@ -127,9 +127,9 @@ def test_a_message_with_an_impossible_time_is_left_out(tmp_path: Path) -> None:
     assert history.span_ns[1] < 1 << 62
 
 
-def test_a_log_begins_with_its_first_message_that_is_not_retained(tmp_path: Path) -> None:
+def test_the_span_of_a_log_does_not_include_an_older_state_at_its_beginning(tmp_path: Path) -> None:
     night = SyntheticLog()
-    state = night.samples[night.places(CAMERA_STATE)[0]]
+    state = night.samples[night.indices(CAMERA_STATE)[0]]
     night.samples = []
     night.frames(STEPS)
     first_ns, last_ns = night.samples[0].receive_time_ns, max(sample.receive_time_ns for sample in night.samples)

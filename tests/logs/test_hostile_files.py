@@ -198,7 +198,7 @@ def test_the_unit_of_a_shape_is_checked_and_that_of_a_map_of_active_actuators_is
     check_files(load(None, {"mirror.flat": str(path)}))
 
 
-def test_an_error_without_text_is_named(tmp_path: Path) -> None:
+def test_an_error_without_text_is_reported_by_its_class(tmp_path: Path) -> None:
     content = fits_file.to_bytes(fits_file.primary_hdu("map"), [])
     parse = Mock(side_effect=MemoryError)
     text = error_of(lambda: fits_file.load(tmp_path / "a.fits", ("map",), "map", parse, content=content))

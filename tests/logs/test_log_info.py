@@ -16,7 +16,7 @@ from tests.support.loops import json_of, lowfc
 from tests.support.mutated_logs import START_NS, START_S, flipped
 from tests.support.report_log import SyntheticLog
 
-SECOND = 10**9
+SECOND_NS = 10**9
 
 
 def sample(key: str, message: Message, count: int, time_ns: int, start_s: int = START_S) -> Sample:
@@ -24,7 +24,7 @@ def sample(key: str, message: Message, count: int, time_ns: int, start_s: int = 
 
 
 def event(name: str, process: str, start_s: int, number: int, **details: object) -> Sample:
-    now_ns = START_NS + 2 * SECOND
+    now_ns = START_NS + 2 * SECOND_NS
     return sample(EVENT.key, EVENTS[name].log(process, now_ns, **details), number, now_ns, start_s)
 
 
@@ -38,10 +38,10 @@ def log(tmp_path: Path) -> Path:
         [Attachment("config.toml", "application/toml", b"[loop]\n")],
     )
     # Calibration loaded an hour before: its time does not extend the log.
-    writer.write(sample(CALIBRATION.key, wire.Calibration(id="c1"), 0, START_NS - 3600 * SECOND))
+    writer.write(sample(CALIBRATION.key, wire.Calibration(id="c1"), 0, START_NS - 3600 * SECOND_NS))
     frames = [n for n in range(50) if n not in (5, 6, 7)]
     for number in range(101):
-        now_ns = START_NS + number * SECOND // 10
+        now_ns = START_NS + number * SECOND_NS // 10
         restarted = number > 50
         count = number - 51 if restarted else number
         if count in frames:  # any message of a kilobyte will do
@@ -50,13 +50,13 @@ def log(tmp_path: Path) -> Path:
             writer.write(sample(STEP.key, wire.ControlStep(), number, now_ns))
     for count, mode in enumerate((wire.LOOP_MODE_OPEN, wire.LOOP_MODE_CLOSED, wire.LOOP_MODE_CLOSED)):
         state = wire.ControllerState(mode=mode)
-        writer.write(sample(CONTROLLER_STATE.key, state, count, START_NS + (count + 1) * SECOND))
+        writer.write(sample(CONTROLLER_STATE.key, state, count, START_NS + (count + 1) * SECOND_NS))
     writer.write(event("CAMERA_RESTARTED", "controller", START_S + 1, 0))
     writer.write(event("CAMERA_RESTARTED", "controller", START_S + 1, 1))
     writer.write(event("RECORDING", "recorder", START_S, 0))
     writer.write(event("MESSAGES_LOST", "recorder", START_S, 1, count=3, topic="lowfc/camera/frame"))
     last = wire.Health(process="controller", state="stopped", topics=[wire.TopicCount(topic=STEP.key, published=101)])
-    writer.write(sample(HEALTH.at("controller"), last, 0, START_NS + 10 * SECOND))
+    writer.write(sample(HEALTH.at("controller"), last, 0, START_NS + 10 * SECOND_NS))
     return writer.finish({"recording": {"messages": str(writer.messages), "messages_lost": "4"}})
 
 
@@ -106,7 +106,7 @@ def test_info_reports_what_was_written(log: Path) -> None:
     }
 
 
-def test_the_text_of_a_run_known_to_be_lockstep_or_not_has_a_remark(log: Path) -> None:
+def test_the_text_says_whether_the_run_was_in_lockstep_if_that_is_known(log: Path) -> None:
     contents = survey.survey(log, digest=True)
     texts = [info.render(contents | {"lockstep": lockstep}) for lockstep in (True, None, False)]
     assert ["(not a lockstep run" in text for text in texts] == [False, False, True]
@@ -117,7 +117,7 @@ def test_the_text_of_a_run_known_to_be_lockstep_or_not_has_a_remark(log: Path) -
 
 def test_the_text_has_the_same_numbers(log: Path) -> None:
     text = lowfc("info", log).stdout
-    for words in (
+    for expected in (
         "complete",
         "2026-01-01T00:00:00.000+00:00, 10.000 s",
         "203; 7 missing by their sequence numbers, 4 counted as lost by the recorder",
@@ -126,7 +126,7 @@ def test_the_text_has_the_same_numbers(log: Path) -> None:
         "config.toml (7 bytes)",
         "lowfc 0.1.0, host bench, run night, seed 3",
     ):
-        assert words in text
+        assert expected in text
     line = next(line.split() for line in text.splitlines() if line.startswith(FRAME.key))
     assert line[1:] == ["94", "9.3", "0.09", "1", "6", "foxglove.RawImage"]
 

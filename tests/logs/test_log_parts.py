@@ -96,7 +96,7 @@ def test_a_log_of_a_killed_recorder_is_the_last_until_it_is_recovered(folder: Pa
 
 
 def test_logs_that_do_not_name_their_recording_are_separate(folder: Path) -> None:
-    """Logs of version 0.1 do not name it."""
+    """Logs of version 0.1 do not name their recording."""
     logs = [LogWriter(folder / f"20260101T00000{n}Z.mcap", 0, METADATA).finish({}) for n in range(3)]
     assert named_logs(logs) == [(log,) for log in logs]
     assert named_files([Path(LAST)]) == logs[-1:]
@@ -145,7 +145,7 @@ KEYS_OF_FILES = {
 
 
 def without_files(results: Any) -> Any:
-    """Results without those that depend on the files or on the time taken."""
+    """Results without the keys whose values depend on the files or on the time taken."""
     if isinstance(results, dict):
         return {key: without_files(value) for key, value in results.items() if key not in KEYS_OF_FILES}
     return results
@@ -153,7 +153,10 @@ def without_files(results: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def ten_files_and_one(tmp_path_factory: pytest.TempPathFactory, samples: list[Sample]) -> Callable[[bool], Path]:
-    """Folder with the same log in ten files and in one: with all samples (True) or with the first quarter of them."""
+    """Function that returns a folder with the same log in ten files and in one file.
+
+    Its argument: whether the log has all samples; otherwise it has the first quarter of them.
+    """
 
     @cache
     def recorded_folder(all_samples: bool) -> Path:

@@ -24,7 +24,7 @@ STEPS = 5
 def published(run: Run, path: Path, last_ns: int) -> tuple[dict[str, Any], str]:
     """Publish a log whose last step has the log time `last_ns`, until a wait is announced; return results and text."""
     night = SyntheticLog().frames(STEPS)
-    night.samples = [night.samples[place] for place in night.places(STEP)]
+    night.samples = [night.samples[index] for index in night.indices(STEP)]
     night.samples[-1] = night.samples[-1]._replace(receive_time_ns=last_ns)
     text, clock = io.StringIO(), HostClock()
     service = SimpleNamespace(running=True, clock=clock)

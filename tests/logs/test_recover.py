@@ -72,9 +72,9 @@ def test_rerun_reads_recovered_logs_completely(recovered: dict[Path, Counter[str
         assert ["Messages", str(counts.total())] in lines
         assert ["Summary", "embedded"] in lines
         listed: Counter[str] = Counter()
-        for words in lines:
-            if len(words) > 2 and words[1].startswith("/"):
-                listed[words[1]] += int(words[2])
+        for columns in lines:
+            if len(columns) > 2 and columns[1].startswith("/"):
+                listed[columns[1]] += int(columns[2])
         assert listed == counts
         assert all(topic in checked for topic in counts)
 

@@ -83,7 +83,7 @@ class Night:
         self._start()
 
     def apply(self, input_: Input, logged: Request | None = None) -> None:
-        """Apply an input and log it, or log `logged` in its place, as a version with another rule would."""
+        """Apply an input and log it, or log `logged` instead, as a version with another rule does."""
         self.now_ns += 1_000_000
         if isinstance(input_, Frame):
             message = RawImage(timestamp=timestamp(input_.time_ns))
@@ -116,7 +116,7 @@ class Night:
             self.put(CONTROLLER_STATE, state.SerializeToString())
         self._last_number = number
 
-    def places(self, topic: Topic) -> list[int]:
+    def indices(self, topic: Topic) -> list[int]:
         """Indices of the messages of a topic."""
         return [index for index, message in enumerate(self.messages) if topic.matches(message.key)]
 
@@ -136,7 +136,7 @@ class Night:
 def replay(
     messages: Iterable[Sample], tolerance_nm: float = 0.0, former: FormerVersion | None = None, **options: Any
 ) -> Account:
-    """Replay messages; with `former`, as those of a log of a former version."""
+    """Replay messages; with `former`, as messages of that former version of lowfc."""
     run = Replay(tolerance_nm, **options)
     run.context.former = former
     for message in messages:
@@ -249,7 +249,7 @@ def test_the_order_between_publishers_does_not_matter(input_list: list[Input], r
     shuffled = sorted(late, key=lambda message: message.receive_time_ns)
     account = replay(shuffled)
     assert account.identical
-    assert account.frames == len(night.places(STEP))
+    assert account.frames == len(night.indices(STEP))
 
 
 @hypothesis_settings(deadline=None, max_examples=EXAMPLES)
@@ -282,8 +282,8 @@ def test_segments_together_give_the_account_of_the_whole_log(
     for fraction, count in gaps:
         first = int(fraction * (len(messages) - 1))
         states = [index for index, message in enumerate(messages) if message.key == CONTROLLER_STATE.key]
-        gone = [index for index in (states if only_states else range(len(messages))) if index >= first][:count]
-        messages = [message for index, message in enumerate(messages) if index not in gone]
+        lost = [index for index in (states if only_states else range(len(messages))) if index >= first][:count]
+        messages = [message for index, message in enumerate(messages) if index not in lost]
     span_ns = messages[-1].receive_time_ns - messages[0].receive_time_ns if messages else 0
     edges = sorted({begun_ns + 1 + int(fraction * span_ns) for fraction in edge_fractions})
     whole = replay(messages)
@@ -301,13 +301,13 @@ def test_segments_together_give_the_account_of_the_whole_log(
 
 def test_after_a_gap_the_replay_continues_at_the_next_state_and_reports_unchecked_steps() -> None:
     night = night_of(frames(100))
-    steps = night.places(STEP)
+    steps = night.indices(STEP)
     account = replay([*night.messages[: steps[30]], *night.messages[steps[40] :]])
     assert account.identical
     assert list(account.unchecked_because) == ["after an input that the log does not have"]
     assert account.frames + account.unchecked == 90
-    without = [message for message in night.messages if message.key != FRAME.key or message.sequence % 100 != 50]
-    assert replay(without).unchecked_because["after a frame that the log does not have"] >= 1
+    without_a_frame = [one for one in night.messages if one.key != FRAME.key or one.sequence % 100 != 50]
+    assert replay(without_a_frame).unchecked_because["after a frame that the log does not have"] >= 1
     head = [message for message in night.messages if message.key == CALIBRATION.key]
     account = replay([*head, *night.messages[len(night.messages) // 2 :]])
     assert account.identical
@@ -362,7 +362,7 @@ def raise_actuator(command: Any, number: int) -> None:
 def tampered(night: Night, topic: Topic, number: int, change: str) -> Account:
     """Change one message slightly, and replay."""
     messages = list(night.messages)
-    index = night.places(topic)[number]
+    index = night.indices(topic)[number]
     body = topic.message.FromString(messages[index].payload)
     exec(change, {"body": body, "raise_actuator": raise_actuator})  # noqa: S102  # the test's own text
     messages[index] = messages[index]._replace(payload=body.SerializeToString())
@@ -397,20 +397,18 @@ def test_the_smallest_difference_is_found_and_reported(topic: Topic, change: str
 
 def test_a_second_message_for_one_input_differs() -> None:
     night = night_of(frames(60))
-    account = replay([*night.messages, night.messages[night.places(STEP)[20]]])
+    account = replay([*night.messages, night.messages[night.indices(STEP)[20]]])
     assert account.different == 1
     assert account.first_difference.fields == ["a second message of input 22"]
 
 
 def test_commands_that_are_not_in_the_log_are_counted() -> None:
     night = night_of(frames(60))
-    commands = night.places(COMMAND)
-    without = [message for index, message in enumerate(night.messages) if index not in commands[10:13]]
-    account = replay(without)
+    commands = night.indices(COMMAND)
+    account = replay(message for index, message in enumerate(night.messages) if index not in commands[10:13])
     assert (account.identical, account.commands, account.commands_missing) == (True, 57, 3)
-    without_any = replay([message for message in night.messages if not COMMAND.matches(message.key)])
-    assert (without_any.different, without_any.commands, without_any.commands_missing) == (0, 0, 60)
-    assert not without_any.identical
+    account = replay(message for message in night.messages if not COMMAND.matches(message.key))
+    assert (account.different, account.commands, account.commands_missing, account.identical) == (0, 0, 60, False)
 
 
 def test_a_log_without_input_numbers_is_refused() -> None:
@@ -447,7 +445,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return report_log.SyntheticLog().frames(STEPS).write(tmp_path_factory.mktemp("night") / "night.mcap")
 
 
-def test_several_processes_give_the_account_of_one(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_several_processes_give_the_same_account_as_one_process(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chunk_ends_ns = workers._chunk_ends_ns  # unsorted, as after a calibration recorded again with its old time
     monkeypatch.setattr(workers, "_chunk_ends_ns", lambda path: chunk_ends_ns(path)[::-1])
     monkeypatch.setattr(workers, "_WORTH_BYTES", 1)
@@ -471,7 +469,7 @@ def test_logs_in_another_order_than_recorded_are_refused(log: Path, tmp_path: Pa
 def test_two_lockstep_runs_with_the_same_sequences_are_replayed_apart(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, other: str
 ) -> None:
-    """Also two runs of one name, `sim-loop --lockstep --run a`."""
+    """This holds also for two runs of the same name (`sim-loop --lockstep --run a`)."""
     paths: list[Path] = []
     for run, gain in (("a", 0.1), (other, 0.2)):
         night = report_log.SyntheticLog().request("gain", (gain,)).frames(200)
@@ -518,12 +516,12 @@ def test_a_forged_command_and_another_host_are_reported(tmp_path: Path, monkeypa
     forged = night.write(tmp_path / "forged.mcap")
     done = lowfc("replay", forged)
     assert done.exit_code == 1
-    for words in (
+    for expected in (
         f"{STEPS} frames, 1 message differs",
         "first difference   MirrorCommand of frame 400 ",
         "actuators: [13] log",
         "numpy              1.0 in the log",
         "cpu_features       abacus in the log, none on this host",
     ):
-        assert words in done.stdout
+        assert expected in done.stdout
     assert lowfc("replay", forged, "--tolerance", 0.001).exit_code == 0

@@ -60,9 +60,9 @@ def check_of(results: dict[str, Any], name: str) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def eventful(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """A log with the loop open and closed, frames lost and dark, gains changed, controller and camera restarted.
+    """Results of a log with the loop open and closed, frames lost and dark, gains changed, and two restarts.
 
-    Of its 2250 frames 6 are lost, so that there are 2244 steps.
+    The controller and the camera restart. Of the 2250 frames 6 are lost, so that there are 2244 steps.
     """
     night = SyntheticLog().health("camera", commands_late=40, state="ready").request("open").frames(300)
     night.request("close")
@@ -134,10 +134,10 @@ def test_latencies_are_those_of_the_messages(eventful: dict[str, Any]) -> None:
 
 def test_a_message_that_the_log_lacks_is_not_a_pause_of_its_sender(tmp_path: Path) -> None:
     night = uneventful(SyntheticLog())
-    gone = {place for topic in (FRAME, COMMAND) for place in night.places(topic)[100:120]}
-    night.samples = [one for place, one in enumerate(night.samples) if place not in gone]
+    lost = {index for topic in (FRAME, COMMAND) for index in night.indices(topic)[100:120]}
+    night.samples = [one for index, one in enumerate(night.samples) if index not in lost]
     intervals = results_of(night.write(tmp_path / "log.mcap"))["timing"]["interval_us"]
-    assert intervals["frames"]["count"] == len(night.places(FRAME)) - 2
+    assert intervals["frames"]["count"] == len(night.indices(FRAME)) - 2
     assert intervals["frames"]["max"] == 1000
     assert intervals["commands"]["max"] < 1100
 
@@ -147,8 +147,7 @@ def test_an_event_has_the_time_of_its_sending_however_late_it_was_recorded(tmp_p
     night.event("RECORDING_FAILED", why="disk full")
     night.frames(10).event("RECORDING")
     uneventful(night, 700)
-    place = night.places(EVENT)[-2]
-    late = night.samples.pop(place)
+    late = night.samples.pop(night.indices(EVENT)[-2])
     night.samples.append(late._replace(receive_time_ns=late.receive_time_ns + 400_000_000))
     *_, event, last = results_of(night.write(tmp_path / "log.mcap"))["events"]
     assert (event["name"], last["name"]) == ("RECORDING_FAILED", "RECORDING")
@@ -185,26 +184,26 @@ def test_the_error_budget_agrees_with_the_known_noise_and_disturbance(eventful: 
 
 
 def test_the_residual_is_given_before_and_after_correction(eventful: dict[str, Any]) -> None:
-    tip = eventful["residual"]["modes"][0]
-    assert tip["name"] == "tilt x"
-    assert tip["disturbance_rms_nm"] == pytest.approx(12 / np.sqrt(2), rel=0.05)
-    assert tip["residual_rms_nm"] < 0.15 * tip["disturbance_rms_nm"]
-    assert tip["pseudo_open_loop_rms_nm"] == pytest.approx(tip["disturbance_rms_nm"], rel=0.05)
-    assert tip["open_residual_rms_nm"] == pytest.approx(12 / np.sqrt(2), rel=0.15)
-    x_mas = tip["residual_rms_nm"] / tilt_nm_per_mas(2.0)
+    tilt_x = eventful["residual"]["modes"][0]
+    assert tilt_x["name"] == "tilt x"
+    assert tilt_x["disturbance_rms_nm"] == pytest.approx(12 / np.sqrt(2), rel=0.05)
+    assert tilt_x["residual_rms_nm"] < 0.15 * tilt_x["disturbance_rms_nm"]
+    assert tilt_x["pseudo_open_loop_rms_nm"] == pytest.approx(tilt_x["disturbance_rms_nm"], rel=0.05)
+    assert tilt_x["open_residual_rms_nm"] == pytest.approx(12 / np.sqrt(2), rel=0.15)
+    x_mas = tilt_x["residual_rms_nm"] / tilt_nm_per_mas(2.0)
     tilt = eventful["residual"]["tilt_mas"]["residual"]
     assert tilt["x"] == pytest.approx(x_mas)
     assert tilt["per_axis"] == pytest.approx(np.sqrt((tilt["x"] ** 2 + tilt["y"] ** 2) / 2))
 
 
 def test_spectra_are_compared_with_theory(eventful: dict[str, Any]) -> None:
-    tip = eventful["spectra"]["groups"][0]
-    assert tip["measured_over_theory"]["median"] == pytest.approx(1, abs=0.02)
-    assert tip["true_over_theory"]["median"] == pytest.approx(1, abs=0.15)
-    assert sum(band["disturbance_rms_nm"] ** 2 for band in tip["bands"]) == pytest.approx(72, rel=0.1)
-    assert tip["bands"][0]["from_hz"] == eventful["spectra"]["resolution_hz"], "slower drift is not in the spectrum"
-    loudest = int(np.argmax(tip["power_nm2_hz"]["disturbance"]))
-    assert tip["frequency_hz"][loudest] == pytest.approx(7, abs=eventful["spectra"]["resolution_hz"])
+    tilt_x = eventful["spectra"]["groups"][0]
+    assert tilt_x["measured_over_theory"]["median"] == pytest.approx(1, abs=0.02)
+    assert tilt_x["true_over_theory"]["median"] == pytest.approx(1, abs=0.15)
+    assert sum(band["disturbance_rms_nm"] ** 2 for band in tilt_x["bands"]) == pytest.approx(72, rel=0.1)
+    assert tilt_x["bands"][0]["from_hz"] == eventful["spectra"]["resolution_hz"], "slower drift is not in the spectrum"
+    loudest = int(np.argmax(tilt_x["power_nm2_hz"]["disturbance"]))
+    assert tilt_x["frequency_hz"][loudest] == pytest.approx(7, abs=eventful["spectra"]["resolution_hz"])
 
 
 @pytest.mark.usefixtures("without_drawings")
@@ -303,7 +302,7 @@ def test_the_noise_is_that_of_the_reconstructor_in_use(tmp_path: Path) -> None:
     assert np.array_equal(closed_loop.noise_of(run.history, slice(None)).total_nm, after.total_nm)
 
 
-def test_a_limit_of_mirror_and_controller_has_the_larger_count(good_results: dict[str, Any]) -> None:
+def test_a_limit_that_acted_at_mirror_and_controller_has_the_larger_count(good_results: dict[str, Any]) -> None:
     limits = {"limits_at_mirror": {"stroke": 50, "slew": 2}, "limits_at_controller": {"stroke": 1, "slew": 3}}
     results = good_results | {"mirror": good_results["mirror"] | limits}
     assert check_of({"verdict": verdict(results)}, "mirror")["text"] == "limits acted: stroke 50, slew 3"
@@ -436,7 +435,7 @@ def test_a_calibration_of_other_modes_leaves_out_former_steps_only_if_it_is_the_
         night.put(CALIBRATION, two)
 
 
-def test_the_stretch_is_of_the_last_calibration_loaded(tmp_path: Path) -> None:
+def test_the_analysed_stretch_is_under_the_calibration_loaded_last(tmp_path: Path) -> None:
     night, other = SyntheticLog(), replace(TOY_CALIBRATION, reconstructor=0.9 * TOY_CALIBRATION.reconstructor)
     night.frames(500).request("open").frames(50).request("close")
     night.load(identified(other))
@@ -486,8 +485,8 @@ def test_frames_refused_as_out_of_order_or_saturated_shift_no_times_and_do_not_c
 
 def test_the_start_of_a_law_is_found_if_its_step_is_lost_and_the_cameras_clock_differs(tmp_path: Path) -> None:
     night = SyntheticLog().frames(50).request("gain", (0.2,)).frames(50)
-    del night.samples[night.places(STEP)[49]]
-    for number in range(len(night.places(STEP))):
+    del night.samples[night.indices(STEP)[49]]
+    for number in range(len(night.indices(STEP))):
         night.change(STEP, number, lambda step: setattr(step.timestamp, "seconds", step.timestamp.seconds - 3600))
     results = results_of(night.write(tmp_path / "x.mcap"))
     assert (results["laws"][-1]["from_s"], results["requests"][-1]["time_s"]) == pytest.approx((0.05, 0.05))
@@ -555,8 +554,8 @@ def test_theory_is_that_of_the_linear_law_in_use(tmp_path: Path, logged: bool) -
     assert stretch["to_s"] == pytest.approx(2.299 if logged else 0.299)
     if logged:
         assert (stretch["steps_settling"], stretch["frames"]) == (200, 1800)
-        tip = report.results["spectra"]["groups"][0]
-        assert tip["measured_over_theory"]["median"] == pytest.approx(1, abs=0.03)
+        tilt_x = report.results["spectra"]["groups"][0]
+        assert tilt_x["measured_over_theory"]["median"] == pytest.approx(1, abs=0.03)
         assert "linear law pi" in page(report)
 
 

@@ -41,7 +41,7 @@ from tools.law_bench import calibrated
 
 RATE_HZ = 250
 Gains = tuple[float, float, float]
-"""Gain of tip and tilt and gain of the others, as fractions of the highest stable gain; leak of all modes."""
+"""Gain of both tilts and gain of the other modes, as fractions of the highest stable gain; leak of all modes."""
 
 HARD, SOFT, LEAKY = (0.45, 0.03, 0.0), (0.1, 0.35, 0.0), (0.5, 0.02, 0.03)
 
@@ -100,7 +100,7 @@ BENCH = {"disturbance__preset": "bench", "disturbance__scale": 0.7}
 def test_in_the_linear_range_a_what_if_agrees_with_a_run_with_those_gains(
     frames: int, pair: tuple[Gains, Gains], delay: float, tolerance_nm: float, overrides: dict[str, Any]
 ) -> None:
-    """The what-if of a run with another run's law predicts each mode's rms to 10 %; with its own, to rounding."""
+    """A what-if with the run's own law reproduces its errors; with another run's law, it predicts their rms to 10 %."""
     configs = [configured(gains, delay, **overrides) for gains in pair]
     calibration = calibrated(configs[0])  # independent of the gains
     runs = [run_loop(config, frames, calibration) for config in configs]
@@ -132,8 +132,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LoggedRun]:
     return runs
 
 
-def results_of(run: LoggedRun, what: WhatIf | None = None) -> dict[str, Any]:
-    found = what_if(run, what or WhatIf())
+def results_of(run: LoggedRun, changes: WhatIf | None = None) -> dict[str, Any]:
+    found = what_if(run, changes or WhatIf())
     assert found == json.loads(json.dumps(found))
     return found
 
@@ -157,12 +157,12 @@ def test_added_contrast_of_shaped_pupil_and_lyot_coronagraph() -> None:
     """A tenth of a nm of spherical in one run, none in the other."""
     spherical = np.diag(0.01 * np.eye(14)[9])
 
-    def found(**keys: object) -> dict[str, Any] | None:
+    def contrast_with(**keys: object) -> dict[str, Any] | None:
         config = configuration({}, **keys)
         return added_contrast(factory.contrast_of(config), {"was": 0 * spherical, "what if": spherical, "other": None})
 
     assert factory.contrast_or_none(load(None, {"sensor.pupil": "elsewhere.npz"})) is None
-    contrast = found()
+    contrast = contrast_with()
     assert contrast is not None
     expected = 0.01 * contrast_form(Coronagraph(factory.sensor(Configuration(), print).pupil), (11,), 550.0).item()
     assert (contrast["was"], contrast["what if"], contrast["other"]) == (0, pytest.approx(expected), None)
@@ -170,8 +170,8 @@ def test_added_contrast_of_shaped_pupil_and_lyot_coronagraph() -> None:
     assert added_contrast_in_words(contrast) == (
         f"added to the dark zone's contrast: was +0.0e+00, what if +{expected:.1e}; spherical contributes most (100 %)"
     )
-    assert found(sensor__modes=10) is None
-    behind_lyot = found(sensor__pupil="circle")
+    assert contrast_with(sensor__modes=10) is None
+    behind_lyot = contrast_with(sensor__pupil="circle")
     assert behind_lyot is not None
     assert behind_lyot["what if"] > 0
 
@@ -252,16 +252,16 @@ def test_automatic_gains_of_a_configuration_file_are_the_logged_ones(
 ) -> None:
     path = tmp_path / "automatic.toml"
     path.write_text('[control]\ntilt_gain="auto"\ngain="auto"\nleak=0.02\n')
-    for given, gains, kept in (
+    for options, gains, remark in (
         (None, [0.4, 0.4, 0.2], "tilt x, tilt y, focus keep the logged gains"),
         ("tilt_gain=0.3", [0.3, 0.3, 0.2], "focus keep the logged gains"),
         ("gain=0.3", [0.3, 0.3, 0.3], ""),
     ):
-        found = results_of(runs["default"], requested_changes(given, path))
+        found = results_of(runs["default"], requested_changes(options, path))
         assert [mode["gain"] for mode in found["modes"]] == pytest.approx(gains)
         warnings = [one for one in found["warnings"] if "automatic" in one]
-        assert len(warnings) == bool(kept)
-        assert kept in "".join(warnings)
+        assert len(warnings) == bool(remark)
+        assert remark in "".join(warnings)
     with pytest.raises(DataFileError, match="its gains are unknown: they are automatic"):
         LoggedRun(replace(history(), controllers=[], configuration=Configuration()))
 
@@ -280,14 +280,14 @@ def test_another_reconstructor_measures_the_same_frames(runs: dict[str, LoggedRu
     calibration_file.save(identified(replace(calibration, reconstructor=R, estimator="pinv")), path)
     by_file = results_of(runs["default"], requested_changes(calibration=path))
     np.testing.assert_allclose(column(by_file, "what_if"), column(by_name, "what_if"), rtol=1e-4)
-    back = results_of(runs["default"], requested_changes("estimator=weighted", calibration=path))
-    np.testing.assert_allclose(column(back, "what_if"), column(back, "was"), rtol=1e-2)
+    weighted = results_of(runs["default"], requested_changes("estimator=weighted", calibration=path))
+    np.testing.assert_allclose(column(weighted, "what_if"), column(weighted, "was"), rtol=1e-2)
 
 
 def test_another_reconstructor_is_weighted_like_the_logged_one(
     runs: dict[str, LoggedRun], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Automatic gains left out focus, of 4 nm rms: with the same weights the logged reconstructor is reproduced."""
+    """Automatic gains left focus, of 4 nm rms, uncorrected: the same weights reproduce the logged reconstructor."""
     run = runs["default"]
     state = deepcopy(run.history.controllers[-1])
     state.prior_nm2[:], state.weighting_flux_dn = [0, 0, 16], toy.FLUX_DN
@@ -304,7 +304,7 @@ def test_another_reconstructor_is_weighted_like_the_logged_one(
 def test_frames_that_are_not_in_the_log_are_counted(
     runs: dict[str, LoggedRun], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another reconstructor cannot measure frames that the log lacks: there the what-if holds its command."""
+    """Another reconstructor cannot measure frames that the log lacks; the what-if holds its command at these frames."""
     run = runs["default"]
     found = run.measured_again(run.calibration)
     np.testing.assert_allclose(found, run.steps.error_nm, atol=1e-4)
@@ -489,12 +489,12 @@ def test_too_few_frames_to_compare_are_an_error() -> None:
     with pytest.raises(DataFileError, match="of 40 frames, 0 were refused, 40 have saturated pixels and 10 are within"):
         rows_compared(LoggedRun(history(saturated_pixels=np.ones(40, np.int64))))
     nothing = np.full((40, 3), np.nan, np.float32)
-    for short, why in (
+    for unusable, reason in (
         (history(error_nm=nothing), "its controller used no frame"),
         (replace(history(), calibration=None), "it has no calibration"),
     ):
-        with pytest.raises(DataFileError, match=why):
-            LoggedRun(short)
+        with pytest.raises(DataFileError, match=reason):
+            LoggedRun(unusable)
     with pytest.raises(DataFileError, match="gains and delay are unknown"):
         LoggedRun(replace(history(), controllers=[]))
 
@@ -511,7 +511,7 @@ def test_warnings_name_what_makes_the_results_doubtful() -> None:
     logged.log.finished = False
     logged.log.damage.append(Damage(77, 5, "the checksum of a chunk is wrong"))
     warnings = "\n".join(what_if(LoggedRun(logged), WhatIf())["warnings"])
-    for words in (
+    for expected in (
         "stroke at 4 frames, slew at 4 frames",
         "the mirror's own limits acted on 2 commands",
         "changed 1 time ",
@@ -522,7 +522,7 @@ def test_warnings_name_what_makes_the_results_doubtful() -> None:
         "a linear law (lqg) was in use",
         "an offset or channels were in force",
     ):
-        assert words in warnings
+        assert expected in warnings
 
 
 def test_a_loop_closed_on_refused_frames_only_is_not_called_never_closed() -> None:

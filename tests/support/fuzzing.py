@@ -60,7 +60,7 @@ def fuzz(target: Target, numbers: range) -> dict[str, Any]:
 
 
 def inputs_by_target(all_targets: list[Target], inputs: int) -> dict[str, int]:
-    """Number of inputs of each target: fewer for slower ones."""
+    """Number of inputs of each target: fewer for slower targets."""
     weights = {target.name: target.cost**-0.75 for target in all_targets}
     total = sum(weights.values())
     return {name: max(1, round(inputs * weight / total)) for name, weight in weights.items()}
@@ -88,7 +88,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--inputs", type=int, default=1_000_000, help="number of inputs, all targets together")
     parser.add_argument("--first", type=int, default=0, help="number of the first input of each target")
-    parser.add_argument("--only", help="targets whose name contains this")
+    parser.add_argument("--only", help="feed only the targets whose name contains this")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     begun_s = time.monotonic()

@@ -1,7 +1,7 @@
 """Print what one host of a multi-host run receives, ten times a second as a line of JSON on standard error.
 
-`good`: number of newest consecutive steps with the loop closed, no reason, and errors below 5 nm. `following`: number
-of newest consecutive states in which the mirror follows commands.
+`good`: number of consecutive steps, up to the newest, with the loop closed, no refusal or limit, and errors below 5 nm.
+`following`: number of consecutive states, up to the newest, in which the mirror follows commands.
 """
 
 import json

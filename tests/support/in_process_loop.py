@@ -143,7 +143,7 @@ class InProcessLoop(Client):
             self.mirror_bus.publisher(EVENT).put(message.SerializeToString())
 
     def report_mirror(self, fault: str) -> None:
-        """Let the controller find that the mirror has a fault, or with an empty text that it follows again."""
+        """Report a fault of the mirror to the controller; an empty text reports that the mirror follows again."""
         self._bench.process_input(MirrorReport(0, fault))
 
     def residual_nm(self, first: int, last: int | None = None) -> npt.NDArray[np.float64]:
@@ -226,7 +226,7 @@ class InProcessLoop(Client):
         listener = (kind, waiting)
         self._listeners.append(listener)
 
-        def each() -> Iterator[Any]:
+        def received() -> Iterator[Any]:
             try:
                 for _ in itertools.islice(itertools.count(), count):
                     while not waiting:
@@ -235,7 +235,7 @@ class InProcessLoop(Client):
             finally:
                 self._listeners = [one for one in self._listeners if one is not listener]
 
-        return each()
+        return received()
 
 
 def run_loop(config: Configuration, frames: int, calibration: Calibration | None = None) -> SimpleNamespace:
@@ -257,7 +257,7 @@ class ThreadedRun:
     """Controller and mirror in threads; a subclass adds the camera, and other processes if it needs them."""
 
     def __init__(self, run_id: str, config: Configuration, new_clock: Callable[[], Clock]) -> None:
-        """Each connection and each service has a clock of `new_clock`."""
+        """Each connection and each service has its own clock, made by `new_clock`."""
         self.run_id, self.config, self.new_clock, self.hub = run_id, config, new_clock, MemoryHub()
 
     def bus(self, role: str) -> MemoryBus:

@@ -183,7 +183,7 @@ def interrupt(process: "subprocess.Popen[str]") -> tuple[str, str]:
 def until(
     condition: Callable[[], object], timeout_s: float = 30.0, *, each: Callable[[], object] = lambda: None
 ) -> None:
-    """Wait for a condition, with a call of `each` before it is checked."""
+    """Wait for a condition; `each` is called before each check."""
     deadline_s = time.monotonic() + timeout_s
     while True:
         each()

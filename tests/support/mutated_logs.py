@@ -48,7 +48,7 @@ def small_samples(frames: int = 40) -> list[Sample]:
 
 
 def small_log(path: Path, *, finished: bool = True) -> Path:
-    """A log of 180 kB, unfinished 156 kB, in twelve chunks."""
+    """A log of twelve chunks: 180 kB, or 156 kB if unfinished."""
     log = LogWriter(path, START_NS, METADATA, ATTACHMENTS)
     for number, sample in enumerate(small_samples()):
         log.write(sample)
@@ -75,19 +75,19 @@ def chunks_of(path: Path) -> list[tuple[int, int]]:
     return [(a, b) for a, b in pairwise(starts) if data[a] == Opcode.CHUNK]
 
 
-def changed(path: Path, at: int, new: bytes) -> Path:
-    """Replace bytes of a file; `at` may be negative, from its end."""
+def changed(path: Path, position: int, new: bytes) -> Path:
+    """Replace bytes of a file; a negative `position` counts from its end."""
     data = bytearray(path.read_bytes())
-    at %= len(data)
-    assert data[at : at + len(new)] != new
-    data[at : at + len(new)] = new
+    position %= len(data)
+    assert data[position : position + len(new)] != new
+    data[position : position + len(new)] = new
     path.write_bytes(data)
     return path
 
 
-def flipped(path: Path, at: int, bit: int = 0) -> Path:
-    """Flip bit `bit` of byte `at` of a file; `at` may be negative, from its end."""
-    return changed(path, at, bytes([path.read_bytes()[at] ^ 1 << bit]))
+def flipped(path: Path, position: int, bit: int = 0) -> Path:
+    """Flip a bit of the byte at `position` of a file; a negative `position` counts from its end."""
+    return changed(path, position, bytes([path.read_bytes()[position] ^ 1 << bit]))
 
 
 def mutated(data: bytes, number: int) -> tuple[str, bytes]:
@@ -95,7 +95,7 @@ def mutated(data: bytes, number: int) -> tuple[str, bytes]:
     rng = np.random.default_rng(number)
     starts = boundaries(data)
     records = [data[a:b] for a, b in pairwise(starts)]
-    places = range(len(records))
+    indices = range(len(records))
     kinds = ("flipped", "flipped head", "cut", "zeroed", "random", "inserted", "deleted", *MISPLACED)
     kind = kinds[number % len(kinds)]
     changed = bytearray(data)
@@ -118,19 +118,19 @@ def mutated(data: bytes, number: int) -> tuple[str, bytes]:
         case _:
             order = {
                 "shuffled": rng.permutation(len(records)),
-                "repeated": [*places[: second + 1], *places[first:]],
-                "removed": [*places[:first], *places[second:]],
-                "swapped": [*places[:first], second, *places[first + 1 : second], first, *places[second + 1 :]],
-                "doubled": [*places[:first], first, *places[first:]],
+                "repeated": [*indices[: second + 1], *indices[first:]],
+                "removed": [*indices[:first], *indices[second:]],
+                "swapped": [*indices[:first], second, *indices[first + 1 : second], first, *indices[second + 1 :]],
+                "doubled": [*indices[:first], first, *indices[first:]],
             }[kind]
-            changed = bytearray(MAGIC + b"".join(records[place] for place in order) + data[starts[-1] :])
+            changed = bytearray(MAGIC + b"".join(records[index] for index in order) + data[starts[-1] :])
     if bytes(changed) == data:
         changed[number % len(data)] ^= 1
     return kind, bytes(changed)
 
 
 ODD_BYTES = (b"", b"\0", b"\xff" * 8, b"\x80" + b"\xff" * 9, b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f", b"\n")
-ODD_WHOLE = (0, 1, 3, 127, 128, 255, 256, 65535, 65536, (1 << 31) - 1, 1 << 31, (1 << 32) - 1, 1 << 40, (1 << 64) - 1)
+ODD_INTS = (0, 1, 3, 127, 128, 255, 256, 65535, 65536, (1 << 31) - 1, 1 << 31, (1 << 32) - 1, 1 << 40, (1 << 64) - 1)
 ODD_FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-45, 3e38, -3e38, 12.3, float("inf"), float("-inf"), float("nan"))
 ODD_TEXTS = ("", "a", "dm", "mirror", "offset", "é", "\0", "x" * 5000, "../..", "{}", "%s", "status")
 MAX_BYTES = 1 << 16
@@ -166,7 +166,7 @@ def damaged(data: bytes, others: Sequence[bytes], rng: Random) -> bytes:
             case 6:
                 changed[at:at] = changed[at : at + rng.randrange(1, 257)]
             case _:
-                number = rng.choice(ODD_WHOLE)
+                number = rng.choice(ODD_INTS)
                 changed[at : at + 8] = struct.pack("<Q", number)
     return bytes(changed)
 
@@ -209,6 +209,6 @@ def _odd(field: FieldDescriptor, rng: Random) -> object:
             return rng.random() < 0.5
         case FieldDescriptor.CPPTYPE_STRING:
             return rng.choice(ODD_TEXTS)
-    whole = rng.choice(ODD_WHOLE) % (1 << _BITS[field.cpp_type])
+    value = rng.choice(ODD_INTS) % (1 << _BITS[field.cpp_type])
     signed = field.cpp_type in (FieldDescriptor.CPPTYPE_INT32, FieldDescriptor.CPPTYPE_INT64)
-    return -whole if signed and rng.random() < 0.5 else whole
+    return -value if signed and rng.random() < 0.5 else value

@@ -28,7 +28,7 @@ class Bench(Listener):
         self.cameras: list[wire.CameraState | None] = []  # settings that the recorder knew before its first log
         self.camera, self.controller = self.service("camera"), self.service("controller")
 
-    def start(self, bytes_per_s: float = 0.0, **more: object) -> None:
+    def start(self, bytes_per_s: float = 0.0, **options: object) -> None:
         def expected(camera: wire.CameraState | None) -> float:
             self.cameras.append(camera)
             return bytes_per_s
@@ -36,7 +36,7 @@ class Bench(Listener):
         bus = MemoryBus(self.hub, "recorder", self.clock)
         metadata = {"lowfc": {"run": "test"}}
         self.recorder = Recorder(
-            bus, self.clock, "test", self.folder, metadata=metadata, expected_bytes_per_s=expected, **more
+            bus, self.clock, "test", self.folder, metadata=metadata, expected_bytes_per_s=expected, **options
         )
         self.thread.start()
         for service in (self.camera, self.controller):
@@ -52,7 +52,7 @@ class Bench(Listener):
         return self.summary
 
     def losses(self) -> Counter[str]:
-        """Messages reported as lost by events, by topic."""
+        """Number of messages that events report as lost, by topic."""
         counts: Counter[str] = Counter()
         for event in self.event_texts("MESSAGES_LOST"):
             _, count, *_, topic = event.split()

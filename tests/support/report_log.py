@@ -94,7 +94,7 @@ class SyntheticLog:
         self.load(self.calibration)
 
     def load(self, calibration: Calibration) -> None:
-        """Load a calibration; the pixels remain those of the first one."""
+        """Load a calibration; the pixels remain those of the first calibration."""
         self.put(CALIBRATION, encode_calibration(calibration, self.now_ns))
         self._publish(advance(self.settings, self._state, Load(self.now_ns, calibration, "test")))
 
@@ -167,19 +167,19 @@ class SyntheticLog:
         sent_ns = self.now_ns + late_ns
         self.samples.append(Sample(key, payload, sequence, sent_ns, sent_ns + 50_000))
 
-    def places(self, topic: Topic) -> list[int]:
+    def indices(self, topic: Topic) -> list[int]:
         """Indices of the samples of a topic."""
-        return [place for place, one in enumerate(self.samples) if topic.matches(one.key)]
+        return [index for index, one in enumerate(self.samples) if topic.matches(one.key)]
 
     def messages(self, topic: Topic) -> list[Any]:
         """Decoded messages of a topic."""
-        return [topic.message.FromString(self.samples[place].payload) for place in self.places(topic)]
+        return [topic.message.FromString(self.samples[index].payload) for index in self.indices(topic)]
 
     def change(self, topic: Topic, number: int, change: Callable[[Any], object]) -> None:
         """Change one message of a topic."""
         change(message := self.messages(topic)[number])
-        place = self.places(topic)[number]
-        self.samples[place] = self.samples[place]._replace(payload=message.SerializeToString())
+        index = self.indices(topic)[number]
+        self.samples[index] = self.samples[index]._replace(payload=message.SerializeToString())
 
     def without(self, *topics: Topic) -> Self:
         """Remove the messages of these topics."""
@@ -194,9 +194,9 @@ class SyntheticLog:
         config: bool = True,
         toml: str | None = None,
         attached: Calibration | None = None,
-        **more: str,
+        **recording: str,
     ) -> Path:
-        """Write the log, finished (with `more` in the metadata of its end) or as left by a recorder that died."""
+        """Write the log, finished (with the metadata `recording`) or as left by a recorder that died."""
         content = (Configuration().to_toml() if toml is None else toml).encode()
         attachments = [Attachment("config.toml", "application/toml", content)] if config else []
         if attached is not None:
@@ -207,7 +207,7 @@ class SyntheticLog:
             if not finish and number % 100 == 99:
                 log.flush()
         if finish:
-            return log.finish({"recording": {"messages": str(len(self.samples)), "messages_lost": "0"} | more})
+            return log.finish({"recording": {"messages": str(len(self.samples)), "messages_lost": "0"} | recording})
         log.flush()
         log.abandon()
         return log.part

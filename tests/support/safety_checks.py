@@ -1,4 +1,4 @@
-"""Properties of `limit`, hand-chosen cases, and the simulated mirror behind its protection."""
+"""Checks of the actuator limits, with hand-chosen cases, and the simulated mirror behind its protection."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -57,19 +57,32 @@ CASES = (
         ("NEIGHBOUR",),
         columns(200, -200, -200),
     ),
-    Case("neighbours, other signs", rows(-190, 190, 190), rows(-230, 230, 230), ("NEIGHBOUR",), rows(-200, 200, 200)),
+    Case(
+        "neighbours, signs reversed", rows(-190, 190, 190), rows(-230, 230, 230), ("NEIGHBOUR",), rows(-200, 200, 200)
+    ),
     Case("neighbours crossing over", rows(60, -60, 0), rows(-45, 45, 0), ("SLEW",), rows(-40, 40, 0)),
     Case("all neighbours together", rows(500, 500, 500), rows(550, 550, 550), (), rows(550, 550, 550)),
     Case(
-        "clipped at neighbours", rows(0, 0, 0), rows(600, -600, -600), ("SLEW", "NEIGHBOUR"), rows(200, -200, -200), 40
+        "clipped at the neighbour limit",
+        rows(0, 0, 0),
+        rows(600, -600, -600),
+        ("SLEW", "NEIGHBOUR"),
+        rows(200, -200, -200),
+        40,
     ),
     Case(
-        "in the margin of neighbours", rows(200, -199.9996, 0), rows(250, -250, 0), ("NEIGHBOUR",), rows(200, -200, 0)
+        "in the margin of the neighbour limit",
+        rows(200, -199.9996, 0),
+        rows(250, -250, 0),
+        ("NEIGHBOUR",),
+        rows(200, -200, 0),
     ),
-    Case("beyond neighbours, to flat", rows(600, 0, 0), rows(0, 0, 0), (), rows(0, 0, 0), 20),
-    Case("beyond neighbours, to more", rows(600, 0, 0), rows(680, 0, 0), ("NEIGHBOUR",), rows(500, 0, 0)),
-    Case("beyond the stroke, to flat", rows(5000, 5000, 5000), rows(0, 0, 0), (), rows(0, 0, 0), 60),
-    Case("beyond the stroke, one step", rows(900, 900, 900), rows(0, 0, 0), ("SLEW",), rows(800, 800, 800)),
+    Case("from beyond the neighbour limit to flat", rows(600, 0, 0), rows(0, 0, 0), (), rows(0, 0, 0), 20),
+    Case(
+        "from beyond the neighbour limit further up", rows(600, 0, 0), rows(680, 0, 0), ("NEIGHBOUR",), rows(500, 0, 0)
+    ),
+    Case("from beyond the stroke to flat", rows(5000, 5000, 5000), rows(0, 0, 0), (), rows(0, 0, 0), 60),
+    Case("from beyond the stroke, one step", rows(900, 900, 900), rows(0, 0, 0), ("SLEW",), rows(800, 800, 800)),
     Case("NaN", rows(1, 2, 3), rows(np.nan, 0, 0), ("NOT_FINITE",), rows(1, 2, 3)),
     Case("infinity", rows(1, 2, 3), rows(0, -np.inf, 0), ("NOT_FINITE",), rows(1, 2, 3)),
     Case("huge", rows(0, 0, 0), rows(3e38, 3e38, 3e38), ("STROKE", "SLEW"), rows(100, 100, 100)),
@@ -118,8 +131,8 @@ def check_case(limit: Callable[[Limits, Single, Single], Limited], case: Case) -
     names = tuple(reason.name for reason in limited.reasons)
     assert names == case.reasons, f"{case.name}: {names}"
     if case.expected_nm is not None:
-        worst = np.abs(shape - case.expected_nm).max()
-        assert worst < 0.01, f"{case.name}: {worst} nm from the expected shape\n{shape}"
+        error_nm = np.abs(shape - case.expected_nm).max()
+        assert error_nm < 0.01, f"{case.name}: {error_nm} nm from the expected shape\n{shape}"
 
 
 class Simulated:

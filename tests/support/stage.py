@@ -64,7 +64,7 @@ class Stage:
         reasons: reasons of every step; with a rejection the frame counts as refused.
         saturated_pixels: number of pixels at full well in every frame.
         flux: light in every frame, relative to the calibration.
-        residual_nm, open_nm: residual, and disturbance, rms of the first mode.
+        residual_nm, open_nm: residual and disturbance in the first mode, nm rms of wavefront.
         behind_s: time by which the view is behind the run.
         on_snapshot: called with every snapshot.
     """
@@ -96,7 +96,7 @@ class Stage:
         self.send(CAMERA_STATE, wire.CameraState(period_ns=20_000_000))
 
     def run(self, seconds: float) -> Verdict:
-        """Send frames at 50 Hz and Health at 2 Hz, with a snapshot at 10 Hz; the verdict at the end."""
+        """Send frames at 50 Hz and Health at 2 Hz, with a snapshot at 10 Hz; return the verdict at the end."""
         for _ in range(round(seconds * 50)):
             self.host_ns += 20_000_000
             self.data_ns += 20_000_000

@@ -87,7 +87,7 @@ class Target:
 
 
 class Loop:
-    """A controller that is given any input; its commands are checked against the limits."""
+    """A controller that processes any input; its commands are checked against the limits."""
 
     def __init__(self) -> None:
         self.state = loaded(NORMAL)

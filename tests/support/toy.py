@@ -49,7 +49,7 @@ TOY = Toy()
 
 
 def calibration(noll: tuple[int, ...] = NOLL, scale: float = 1.0) -> Calibration:
-    """Calibration of the toy with some of its modes; another `scale` makes a different one."""
+    """Calibration of the toy with some of its modes; another `scale` of the response makes another calibration."""
     good = np.ones(SHAPE[0] * SHAPE[1])
     chosen = [NOLL.index(index) for index in noll]
     I0, H = normalise_flux(TOY.reference, TOY.response[:, chosen] * scale, good)

@@ -131,7 +131,7 @@ class Page:
 
 @contextlib.contextmanager
 def browser(folder: Path, size_px: tuple[int, int], *, webgl: bool = False) -> Iterator[Page]:
-    """Run a headless Chromium with its own profile; it can connect to this host only. `webgl`: in software, slow."""
+    """Run a headless Chromium with its own profile, connected to this host only; with `webgl`, it draws in software."""
     quiet = ("quic", "background-networking", "component-update", "sync", "default-apps", "extensions", "dev-shm-usage")
     options = ["headless", "no-sandbox", "no-first-run", "hide-scrollbars", "remote-debugging-port=0"]
     drawing = ("use-angle=swiftshader", "enable-unsafe-swiftshader", "ignore-gpu-blocklist")

@@ -174,7 +174,9 @@ def test_a_late_client_receives_the_calibration(bus: MemoryBus) -> None:
                 assert client.next() == ("/" + CALIBRATION.key, 3, calibration)
 
 
-def test_a_client_that_does_not_read_loses_messages_and_blocks_nobody(bridge: FoxgloveBridge, bus: MemoryBus) -> None:
+def test_a_client_that_does_not_read_loses_messages_and_blocks_no_other_client(
+    bridge: FoxgloveBridge, bus: MemoryBus
+) -> None:
     truth = bus.publisher(TRUTH)
     payload = wire.Truth(residual_nm=[1.0] * 4000).SerializeToString()
     count = 3000  # 48 MB: more than the sockets hold

@@ -178,7 +178,7 @@ def viewer_dies(bench: ViewBench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.viewers[0].alive = False
 
 
-def reads_nothing(bench: ViewBench, monkeypatch: pytest.MonkeyPatch) -> None:
+def viewer_reads_nothing(bench: ViewBench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_view, "STUCK_S", 0.1)
 
 
@@ -195,16 +195,16 @@ def view_grows(bench: ViewBench, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fail", "stuck", "why"),
+    ("fail", "stuck", "reason"),
     [
         (viewer_dies, 0, "the viewer was killed"),
-        (reads_nothing, 1, "read nothing for"),
+        (viewer_reads_nothing, 1, "read nothing for"),
         (viewer_grows, 0, "the viewer uses 16"),
         (view_grows, 0, "the view uses 512 MB"),
     ],
 )
 def test_a_failed_viewer_is_restarted_and_shows_everything(
-    benches: ViewBenches, monkeypatch: pytest.MonkeyPatch, fail: Callable[..., None], stuck: int, why: str
+    benches: ViewBenches, monkeypatch: pytest.MonkeyPatch, fail: Callable[..., None], stuck: int, reason: str
 ) -> None:
     bench = benches(stuck=stuck)
     bench.publish()
@@ -214,7 +214,7 @@ def test_a_failed_viewer_is_restarted_and_shows_everything(
     assert bench.viewers[0].stopped.is_set()
     bench.publish()
     until(lambda: bench.drawn(2))
-    assert any(why in event for event in bench.event_texts("VIEW_RENEWED"))
+    assert any(reason in event for event in bench.event_texts("VIEW_RENEWED"))
     assert bench.failure is None
 
 

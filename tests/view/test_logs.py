@@ -302,7 +302,7 @@ def test_every_view_of_the_layout_has_data_and_the_plots_span_the_whole_log(tmp_
     assert not {sensor.FRAME, mirror.ACTUATORS, pointing.TRAIL} & {str(view.origin) for view in operator}
 
 
-def test_a_damaged_log_is_drawn_and_the_remark_names_the_place_the_reason_and_the_lost_time(
+def test_a_damaged_log_is_drawn_and_the_remark_names_the_position_the_reason_and_the_lost_time(
     tmp_path: Path, shown: Shown
 ) -> None:
     log = SyntheticLog().frames(800).write(tmp_path / "night.mcap")
@@ -310,14 +310,14 @@ def test_a_damaged_log_is_drawn_and_the_remark_names_the_place_the_reason_and_th
     flipped(log, (begin + end) // 2)
     [remark] = drawn(log)[0].remarks
     assert (tile(shown[-1], "LOG").value, tile(shown[-1], "LOG").level) == ("DAMAGED", Level.WARNING)
-    place = rf"left out at byte {begin}, \d+ bytes"
+    position = rf"left out at byte {begin}, \d+ bytes"
     reason = "(the checksum of a chunk is wrong|a chunk cannot be decompressed)"
-    assert re.fullmatch(rf"night\.mcap: {place}: {reason}; 0\.\d+ s between the messages around it", remark)
+    assert re.fullmatch(rf"night\.mcap: {position}: {reason}; 0\.\d+ s between the messages around it", remark)
 
 
 def test_a_log_begins_with_its_first_frame_and_not_with_an_older_calibration(tmp_path: Path) -> None:
     night = SyntheticLog().frames(100)
-    calibration = night.samples[night.places(CALIBRATION)[0]]
+    calibration = night.samples[night.indices(CALIBRATION)[0]]
     earlier_ns = calibration.receive_time_ns - 3600 * 10**9
     night.samples = [calibration._replace(receive_time_ns=ns) for ns in (earlier_ns, night.now_ns)] + night.samples
     done, tape = drawn(night.write(tmp_path / "night.mcap"))
@@ -342,7 +342,7 @@ def test_a_frame_of_a_camera_whose_clock_is_ahead_does_not_move_the_time_line(tm
     assert max(drawn_ns) < end_ns + 10**9  # no picture or row at the time of the camera's clock
 
 
-def test_the_largest_stroke_of_a_log_is_taken_over_all_mirror_states(tmp_path: Path, shown: Shown) -> None:
+def test_the_stroke_of_a_log_is_the_largest_of_all_its_mirror_states(tmp_path: Path, shown: Shown) -> None:
     night = SyntheticLog().frames(120)
     night.change(MIRROR_STATE, 101, lambda state: setattr(state, "actuators", np.full(GRID, -350, "<f4").tobytes()))
     drawn(night.write(tmp_path / "night.mcap"))
@@ -413,7 +413,7 @@ def test_earlier_events_are_read_from_the_log_finished_or_not(tmp_path: Path, fi
     night.frames(100)
     night.event("RECORDING_STOPPED", why="operator asked")
     night.write(tmp_path / "night.mcap", finish=finish)
-    expected = [night.samples[place] for place in night.places(EVENT)]
+    expected = [night.samples[index] for index in night.indices(EVENT)]
     found = earlier_events(recorder_of(tmp_path / "night.mcap", platform.node()), 0)
     assert [(one.sequence, one.payload) for one in found] == [(one.sequence, one.payload) for one in expected]
     accumulator = accumulated([*expected[-1:], *found])  # the last one also arrived on the bus

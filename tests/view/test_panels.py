@@ -353,7 +353,7 @@ def test_a_brighter_dark_zone_is_brighter_in_the_picture() -> None:
     assert len(tape.rows[science.CONTRAST.path]) == 2
 
 
-def test_the_trail_has_at_most_400_points_the_last_of_which_is_the_newest() -> None:
+def test_the_trail_has_at_most_400_points_and_ends_at_the_newest() -> None:
     tape, residual_nm = Tape(), np.outer(np.arange(1.0, 800.0), np.ones(MODES))
     drawn(pointing.Pointing(1.0), tape, 0, truths=truths(residual_nm, residual_nm))
     points = values_of(tape.last(f"{pointing.TRAIL}/points").positions)
@@ -367,7 +367,7 @@ CAMERA = wire.CameraState(period_ns=round(1e9 / RATE_HZ))
 
 @pytest.fixture(scope="module")
 def tone() -> tuple[Any, Any]:
-    """Pseudo-open-loop, a tone in the first mode and white noise in all, and the error under the law."""
+    """Pseudo-open-loop, a tone in the first mode plus white noise in each, and the error under `LAW`, nm."""
     frames = 3000
     pol_nm = np.random.default_rng(1).normal(0, 0.2, (frames, MODES))
     pol_nm[:, 0] += TONE_NM * np.sqrt(2) * np.sin(2 * np.pi * TONE_HZ / RATE_HZ * np.arange(frames))

@@ -100,7 +100,7 @@ LEASE = wire.Lease(holds=True, holder="calibrate")
 ALL_PROCESSES = ("camera", "controller", "mirror-dm", "recorder")
 HARMFUL = "worse than a flat mirror: `lowfc ctl safe` flattens it"
 STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
-    # name: the change; title, value and level of the tile that shows it; words of the headline
+    # name: the change; title, value and level of the tile that shows it; a part of the headline
     "healthy": (setting(), "LOOP CLOSED GOOD", "nothing is wrong"),
     "open": (setting(mode=LoopMode.OPEN), "LOOP OPEN NEUTRAL", "lowfc ctl close"),
     "open, worse than flat": (setting(mode=LoopMode.OPEN, residual_nm=60.0), "LOOP OPEN NEUTRAL", HARMFUL),
@@ -183,11 +183,11 @@ def verdicts() -> dict[str, Verdict]:
 
 @pytest.mark.parametrize("name", STATES)
 def test_each_state_has_its_tile_level_and_headline(verdicts: dict[str, Verdict], name: str) -> None:
-    _, expected, words = STATES[name]
+    _, expected, part_of_headline = STATES[name]
     verdict = verdicts[name]
     found = tile(verdict, expected.split()[0])
     assert f"{found.title} {found.value} {found.level.name}" == expected, verdict
-    assert words in verdict.headline
+    assert part_of_headline in verdict.headline
     assert all(one.advice for one in verdict.tiles if one.level is verdict.level >= Level.WARNING)
     assert verdict.level is (found.level if found.level >= Level.WARNING else tile(verdict, "LOOP").level)
 
@@ -417,11 +417,11 @@ def test_an_idle_loop_names_the_cause(verdicts: dict[str, Verdict]) -> None:
 
 
 @pytest.mark.parametrize(
-    "why", ["the camera's frames fit the calibration", "an interlock acts: camera_temp is 41", "camera exchange"]
+    "reason", ["the camera's frames fit the calibration", "an interlock acts: camera_temp is 41", "camera exchange"]
 )
-def test_a_loop_that_opened_for_another_reason_is_not_blamed_on_the_camera(why: str) -> None:
-    verdict = verdict_after(to_mode(LoopMode.OPEN, why), 2)
-    assert tile(verdict, "LOOP").detail.startswith(why)
+def test_a_loop_that_opened_for_another_reason_is_not_blamed_on_the_camera(reason: str) -> None:
+    verdict = verdict_after(to_mode(LoopMode.OPEN, reason), 2)
+    assert tile(verdict, "LOOP").detail.startswith(reason)
     assert (tile(verdict, "LOOP").level, verdict.level) == (Level.NEUTRAL, Level.NEUTRAL)
 
 
@@ -489,7 +489,7 @@ def test_text_stays_inside_its_tile_and_off_its_border(level: Level, tiles: int)
         border = np.ones(inside.shape[:2], bool)
         border[2:-2, 2:-2] = False
         assert (inside[border] == FILL[level]).all()
-        assert (inside != FILL[level]).any(axis=2).mean() > 0.03  # there are words
+        assert (inside != FILL[level]).any(axis=2).mean() > 0.03  # the tile has text
         outside[y0:y1, x0:x1] = False
     assert (shown[outside] == GROUND).all()
 

@@ -1,6 +1,6 @@
 """The viewer layouts in deploy/layouts: every message path in them is a field of the message on that topic.
 
-A renamed field or topic fails here rather than during operation.
+If a field or topic is renamed, a test fails here rather than a layout during operation.
 """
 
 import json

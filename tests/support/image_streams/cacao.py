@@ -1,9 +1,10 @@
 """Emulation of a CACAO bench: the simulated camera's frames in a stream, the mirror behind channels.
 
-A program outside the run, with a configuration file and a folder of streams as arguments: it writes frames to
-`camnsv`, sums the existing channels dm00disp00 to dm00disp11 into `dm00disp`, without the mean, and applies the sum to
-the optics. It executes lines of standard input between two frames: `renew` and `region` recreate the camera's stream,
-`die` ends the program in the middle of an image, `stop` prints the frame count and the residual, and ends.
+A program outside the run, with a configuration file and a folder of streams as arguments. It writes frames to
+`camnsv`. It writes the sum of the existing channels dm00disp00 to dm00disp11, minus the mean, to `dm00disp`, and
+applies it to the optics. It executes lines of standard input between two frames: `renew` and `region` recreate the
+camera's stream, `die` ends the program in the middle of an image, `stop` prints the frame count and the residual, and
+ends the program.
 """
 
 import json
@@ -60,7 +61,7 @@ class Comb:
             if time.monotonic() - searched_s > 0.2:
                 self.find_channels()
                 searched_s = time.monotonic()
-            busiest = max(self.channels.values(), key=lambda one: one.count)  # the loop's
+            busiest = max(self.channels.values(), key=lambda one: one.count)  # the loop's channel
             busiest.wait(0, 0.01)
             counts = {name: one.count for name, one in self.channels.items()}
             if counts != self.counts:
