@@ -52,7 +52,7 @@ def settings(name: str) -> dict[str, list[str]]:
 
 
 def processors(name: str) -> set[int]:
-    """Processors of a unit on a host with sixteen."""
+    """Processors of a unit on a host with sixteen processors."""
     (affinity,) = settings(name)["CPUAffinity"]
     ends = [[int(end) for end in span.split("-")] for span in affinity.split()]
     return {cpu for first, *last in ends for cpu in range(first, max([first, *last]) + 1) if cpu < 16}
@@ -173,7 +173,7 @@ def test_the_units_match_the_programs_and_the_configuration() -> None:
     assert float(settings("lowfc-sim-camera.service")["WatchdogSec"][0]) > PATIENCE_S
 
 
-def test_the_document_names_the_files_of_the_latch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_readme_of_deploy_names_the_files_of_the_latch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     runtime, state = tmp_path / "run", tmp_path / "state"
     runtime.mkdir(mode=0o700)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
@@ -308,7 +308,7 @@ class Supervised:
 
 
 @pytest.mark.exclusive
-def test_processes_notify_ready_watchdog_and_stopping(tmp_path: Path) -> None:
+def test_processes_notify_systemd_that_they_are_ready_alive_and_stopping(tmp_path: Path) -> None:
     with contextlib.ExitStack() as stack:
         names = ("recorder", "sim-mirror", "controller", "sim-camera")
         processes = {name: stack.enter_context(contextlib.closing(Supervised(name, tmp_path))) for name in names}
@@ -323,9 +323,9 @@ def test_processes_notify_ready_watchdog_and_stopping(tmp_path: Path) -> None:
         def quiet() -> bool:
             """Whether the controller sends no WATCHDOG=1 while the mirror, with the same period, sends five."""
             time.sleep(0.05)  # receive what was sent before
-            before, others = controller.manager.beats, mirror.manager.beats
-            until(lambda: mirror.manager.beats >= others + 5)
-            return controller.manager.beats == before
+            controller_beats, mirror_beats = controller.manager.beats, mirror.manager.beats
+            until(lambda: mirror.manager.beats >= mirror_beats + 5)
+            return controller.manager.beats == controller_beats
 
         assert not quiet()
         controller.process.send_signal(signal.SIGSTOP)

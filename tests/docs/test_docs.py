@@ -44,7 +44,7 @@ PROGRAMS = ("lowfc", "sim-camera", "sim-dm", "make", "rerun", "python")
 
 
 def commands(document: Path) -> list[str]:
-    """Command lines of a document: indented by four or more, as in a list, without trailing comments."""
+    """Command lines of a document without trailing comments; indented by four spaces, or by more within a list."""
     lines = re.findall(r"^ {4,}(\S.*)$", document.read_text(), flags=re.MULTILINE)
     bare = [line.split("  #")[0].strip() for line in lines]
     return [line for line in bare if line.split()[0] in PROGRAMS]

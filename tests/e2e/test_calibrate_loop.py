@@ -90,7 +90,7 @@ lowest_hz = 1.5
 
 
 @pytest.mark.slow
-def test_rejection_of_a_running_loop_and_of_its_log(tmp_path: Path) -> None:
+def test_the_rejection_measured_on_a_running_loop_and_from_its_log_is_the_same(tmp_path: Path) -> None:
     (tmp_path / "loop.toml").write_text(REJECTION_CONFIG)
     options = ("--duration", "4", "--lines", "8", "--json", "--plot", "live.png")
     loop = start(tmp_path, "sim-loop", "--config", "loop.toml", "--lockstep")  # independent of the host's load

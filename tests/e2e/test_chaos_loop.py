@@ -31,7 +31,7 @@ def test_a_case_passes_and_its_log_is_kept(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(2400)
-def test_half_an_hour_shows_no_growth_and_no_loss(tmp_path: Path) -> None:
+def test_a_soak_of_half_an_hour_finds_no_growth_and_no_loss(tmp_path: Path) -> None:
     done = run(tmp_path, "soak", "--hours", "0.5", "--json", timeout_s=2300)
     assert json.loads(done.stdout)["why"] == []
     assert done.returncode == 0

@@ -43,14 +43,14 @@ def test_the_loop_does_not_undo_the_steps(dark_hole_run: DarkHoleRun) -> None:
     channel = dark_hole_run.channels[SHIFTED]
     assert len(channel.channel_nm) == STEPS + 1
     assert np.linalg.norm(channel.channel_nm[-1]) > 15, "nm of wavefront that a loop without the shift would undo"
-    undone, error = channel.undone()
-    assert abs(undone) < 0.01
+    undone_fraction, error = channel.undone()
+    assert abs(undone_fraction) < 0.01
     assert error < 0.005
 
 
 def test_without_the_shift_the_loop_undoes_the_steps(dark_hole_run: DarkHoleRun) -> None:
-    undone, _ = dark_hole_run.channels[PLAIN].undone()
-    assert undone == pytest.approx(1, abs=0.1)
+    undone_fraction, _ = dark_hole_run.channels[PLAIN].undone()
+    assert undone_fraction == pytest.approx(1, abs=0.1)
 
 
 def test_the_residual_grows_by_less_than_a_fifth(dark_hole_run: DarkHoleRun) -> None:

@@ -83,8 +83,8 @@ class Bench:
         }
 
     def start(self) -> None:
-        for name, place in HOST_OF.items():  # before the router: processes may start in any order
-            self.begin(self.lab[place], name)
+        for name, host in HOST_OF.items():  # before the router: processes may start in any order
+            self.begin(self.lab[host], name)
         self.begin(self.lab.middle, "router")
         config = str(self.lab.middle.folder / "lowfc.toml")
         self.lab.middle.start("observer", str(SUPPORT / "host_observer.py"), RUN, config, "viewer")
@@ -164,7 +164,7 @@ def test_a_host_has_its_own_network_from_the_start(tmp_path: Path) -> None:
 
 
 def clock_offset_ns(host: Host) -> int:
-    """A host's offset from the monotonic clock, which all hosts share here, to its epoch."""
+    """The offset that a host adds to the monotonic clock, which all hosts share here, to get nanoseconds since 1970."""
     return int(next((host.folder / "runtime" / "lowfc").glob("clock-*")).read_text())
 
 
@@ -174,8 +174,8 @@ def test_clock_offsets_are_measured_and_requests_and_a_view_work_from_another_ho
     assert done.returncode == 0, done.stderr
     rows = {row["process"]: row for row in json.loads(done.stdout)["processes"]}
     assert {*HOST_OF, ROUTER} <= set(rows)
-    for process, place in HOST_OF.items():
-        truth_us = (clock_offset_ns(bench.lab.middle) - clock_offset_ns(bench.lab[place])) / 1e3
+    for process, host in HOST_OF.items():
+        truth_us = (clock_offset_ns(bench.lab.middle) - clock_offset_ns(bench.lab[host])) / 1e3
         assert rows[process]["clock_error_us"] > 0
         assert abs(rows[process]["clock_offset_us"] - truth_us) <= rows[process]["clock_error_us"] + 0.001
     done = desk.run("-m", "lowfc", "ctl", "open", "--run", RUN)
@@ -339,7 +339,7 @@ def test_a_forged_command_with_the_controllers_certificate_reaches_the_mirror(be
 
 
 def test_a_forger_gets_nothing_and_moves_nothing(bench: Bench, tmp_path: Path) -> None:
-    """A forger has a certificate of another role, of no known role or of a foreign authority, or none, or no TLS."""
+    """The certificates of the forgers: of another role, of an unknown role, of a foreign authority; two have none."""
     camera, desk = bench.lab["camera"], bench.lab["desk"]
     make_certificates(bench.authority, ["stranger"], [])
     make_certificates(tmp_path, ROLES, [])

@@ -40,8 +40,8 @@ def layout(holes: list[list[float]]) -> str:
         (f"[recorder]\nfolder = '{'x' * 300}'", "x cannot be accessed: File name too long"),
     ],
 )
-def test_an_invalid_configuration_is_refused(tmp_path: Path, config: str, expected: str) -> None:
-    _refused(tmp_path, *SHORT, config=config, expected=expected)
+def test_an_invalid_configuration_is_refusal(tmp_path: Path, config: str, expected: str) -> None:
+    _refusal(tmp_path, *SHORT, config=config, expected=expected)
 
 
 @pytest.mark.parametrize(
@@ -54,12 +54,12 @@ def test_an_invalid_configuration_is_refused(tmp_path: Path, config: str, expect
 )
 def test_check_refuses_what_a_run_would_refuse(tmp_path: Path, config: str, expected: str) -> None:
     (tmp_path / "lowfc.toml").write_text(config)
-    _refused(tmp_path, "config", "check", "lowfc.toml", expected=expected)
+    _refusal(tmp_path, "config", "check", "lowfc.toml", expected=expected)
 
 
-def test_an_invalid_layout_is_refused(tmp_path: Path) -> None:
+def test_an_invalid_layout_is_refusal(tmp_path: Path) -> None:
     (tmp_path / "mask.json").write_text(layout([[0.0, 0.2], [0.05, 0.2]]))
-    _refused(tmp_path, *SHORT, "--sensor", "mask.json:mine", expected="overlap")
+    _refusal(tmp_path, *SHORT, "--sensor", "mask.json:mine", expected="overlap")
 
 
 def test_an_even_symmetric_layout_is_warned_about(tmp_path: Path) -> None:
@@ -71,11 +71,11 @@ def test_an_even_symmetric_layout_is_warned_about(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_an_invalid_calibration_is_refused(tmp_path: Path) -> None:
-    words = ["controller", "--run", "mistakes", "--calibration"]
-    _refused(tmp_path, *words, "none.fits", expected="there is no such calibration file")
+def test_an_invalid_calibration_is_refusal(tmp_path: Path) -> None:
+    arguments = ["controller", "--run", "mistakes", "--calibration"]
+    _refusal(tmp_path, *arguments, "none.fits", expected="there is no such calibration file")
     (tmp_path / "text.fits").write_bytes(b"hello")
-    _refused(tmp_path, *words, "text.fits", expected="text.fits")
+    _refusal(tmp_path, *arguments, "text.fits", expected="text.fits")
 
 
 def test_a_port_in_use_is_named(tmp_path: Path) -> None:
@@ -85,7 +85,7 @@ def test_a_port_in_use_is_named(tmp_path: Path) -> None:
             busy.bind(("127.0.0.1", held.links.ports["recorder"]))
             busy.listen()
             port = str(held.links.ports["recorder"])
-            stderr = _refused(tmp_path, "record", "--run", "mistakes-port", expected=port)
+            stderr = _refusal(tmp_path, "record", "--run", "mistakes-port", expected=port)
         assert "Address already in use" in stderr
         assert ".rs" not in stderr
         assert "cargo" not in stderr
@@ -94,37 +94,37 @@ def test_a_port_in_use_is_named(tmp_path: Path) -> None:
 
 
 def test_unknown_runs_arguments_and_files_are_named(tmp_path: Path, own_runtime: Path) -> None:
-    _refused(tmp_path, "ctl", "status", expected="lowfc was searched")
-    _refused(tmp_path, "ctl", "status", "--run", "none-such", expected="there is no run 'none-such': no loop of user")
-    _refused(tmp_path, "ctl", "--run", "none-such", "record", "stop", expected="there is no run 'none-such'")
-    _refused(tmp_path, "ctl", "gain", "often", expected="'often' is not a number")
-    _refused(tmp_path, "config", "check", "none.toml", expected="none.toml")
-    _refused(tmp_path, "sim-lop", expected="sim-lop")
-    _refused(tmp_path, *SHORT, "--sensor", "", expected="unknown sensor ''")
+    _refusal(tmp_path, "ctl", "status", expected="lowfc was searched")
+    _refusal(tmp_path, "ctl", "status", "--run", "none-such", expected="there is no run 'none-such': no loop of user")
+    _refusal(tmp_path, "ctl", "--run", "none-such", "record", "stop", expected="there is no run 'none-such'")
+    _refusal(tmp_path, "ctl", "gain", "often", expected="'often' is not a number")
+    _refusal(tmp_path, "config", "check", "none.toml", expected="none.toml")
+    _refusal(tmp_path, "sim-lop", expected="sim-lop")
+    _refusal(tmp_path, *SHORT, "--sensor", "", expected="unknown sensor ''")
 
 
-def _refused(folder: Path, *words: str, expected: str, config: str = "") -> str:
+def _refusal(folder: Path, *arguments: str, expected: str, config: str = "") -> str:
     if config:
         (folder / "test.toml").write_text(config)
-        words = (*words, "--config", "test.toml")
-    if words[0] in {"record", "view"}:  # these commands lower the priority of their process for good
-        done = run(folder, *words)
+        arguments = (*arguments, "--config", "test.toml")
+    if arguments[0] in {"record", "view"}:  # these commands lower the priority of their process for good
+        done = run(folder, *arguments)
         assert (done.returncode, done.stdout) == (2, ""), done.stderr
         complaint = done.stderr.removeprefix("error: ").rstrip("\n")
     else:
         with contextlib.chdir(folder):
-            here = lowfc(*words)
-        assert not here.stdout
-        assert isinstance(here.exception, LowfcError | SystemExit), here.exception
-        assert getattr(here.exception, "exit_status", 2) == 2
-        complaint = str(here.exception) if isinstance(here.exception, LowfcError) else here.stderr
+            result = lowfc(*arguments)
+        assert not result.stdout
+        assert isinstance(result.exception, LowfcError | SystemExit), result.exception
+        assert getattr(result.exception, "exit_status", 2) == 2
+        complaint = str(result.exception) if isinstance(result.exception, LowfcError) else result.stderr
     assert expected in complaint
     assert not (folder / "logs").exists()
     return complaint
 
 
 @pytest.mark.parametrize(
-    ("words", "output", "status", "error"),
+    ("arguments", "output", "status", "error"),
     [
         ("--version", ">/dev/full", 2, "error: standard output cannot be written: No space left on device\n"),
         ("--version", ">&-", 2, "error: standard output cannot be written: Bad file descriptor\n"),
@@ -132,10 +132,10 @@ def _refused(folder: Path, *words: str, expected: str, config: str = "") -> str:
         ("runs --help", "2>&-", 0, ""),
     ],
 )
-def test_a_full_disk_or_a_closed_stream_gives_at_most_one_line(
-    words: str, output: str, status: int, error: str
+def test_a_full_disk_or_a_closed_stream_causes_at_most_one_line_of_error(
+    arguments: str, output: str, status: int, error: str
 ) -> None:
-    script = ["sh", "-c", f'exec "$@" {words} {output}', "sh", *LOWFC]
+    script = ["sh", "-c", f'exec "$@" {arguments} {output}', "sh", *LOWFC]
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     done = subprocess.run(script, env=buffered, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (status, error)
@@ -149,9 +149,9 @@ def test_a_used_up_quota_or_file_size_limit_has_a_one_line_error(fault: str) -> 
     assert (done.returncode, done.stderr) == (2, "error: standard output cannot be written: no room\n")
 
 
-@pytest.mark.parametrize("words", ["main config show", "sim_camera --help", "sim_dm --help"])
-def test_ctrl_c_during_startup_prints_no_traceback(tmp_path: Path, words: str) -> None:
-    entry, *options = words.split()
+@pytest.mark.parametrize("arguments", ["main config show", "sim_camera --help", "sim_dm --help"])
+def test_ctrl_c_during_startup_prints_no_traceback(tmp_path: Path, arguments: str) -> None:
+    entry, *options = arguments.split()
     start = [sys.executable, "-c", f"from lowfc.__main__ import {entry}; {entry}()", *options]
     process = subprocess.Popen(start, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
     until(lambda: "pydantic_core" in Path(f"/proc/{process.pid}/maps").read_text(), 20)  # in the middle of the imports
@@ -161,7 +161,7 @@ def test_ctrl_c_during_startup_prints_no_traceback(tmp_path: Path, words: str) -
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("arguments", "expected"),
     [
         (("info", "empty.mcap"), "empty.mcap is empty: nothing was recorded"),
         (("recover", "header.mcap"), "no part of it is intact, so there is nothing to recover"),
@@ -178,7 +178,7 @@ def test_ctrl_c_during_startup_prints_no_traceback(tmp_path: Path, words: str) -
         (("bench", "record", "--folder", "nowhere"), "nowhere cannot be written"),
     ],
 )
-def test_unusable_logs_and_files_are_refused_in_one_line(tmp_path: Path, words: tuple[str, ...], expected: str) -> None:
+def test_unusable_files_are_refused_in_one_line(tmp_path: Path, arguments: tuple[str, ...], expected: str) -> None:
     (tmp_path / "empty.mcap").touch()
     (tmp_path / "header.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(12))
     LogWriter(tmp_path / "night.mcap", 1, {}).finish({})
@@ -186,7 +186,7 @@ def test_unusable_logs_and_files_are_refused_in_one_line(tmp_path: Path, words: 
     (tmp_path / "circle").symlink_to("circle")
     (tmp_path / "brackets.toml").write_text("a = " + "[" * 100_000)
     before = sorted(path.name for path in tmp_path.iterdir())
-    assert len(_refused(tmp_path, *words, expected=expected).splitlines()) == 1
+    assert len(_refusal(tmp_path, *arguments, expected=expected).splitlines()) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
@@ -196,7 +196,7 @@ def test_a_starting_loop_is_listed_and_makes_a_request_without_a_run_ambiguous(
     """A request without a run must not be sent to `other` just because `night` has no controller yet."""
     found: list[object] = []
 
-    def meanwhile(config: Configuration, run: Run, console: object) -> None:
+    def run_other_commands(config: Configuration, run: Run, console: object) -> None:
         with contextlib.closing(ZenohBus(open_run("other").links, Role.CONTROLLER, HostClock())):
             done = lowfc("ctl", "open")
             listed = json_of("runs")["runs"]
@@ -206,7 +206,7 @@ def test_a_starting_loop_is_listed_and_makes_a_request_without_a_run_ambiguous(
         assert "recording into" not in done.stderr
         raise BusError("enough")
 
-    monkeypatch.setattr(sim_loop, "prepare", meanwhile)
+    monkeypatch.setattr(sim_loop, "prepare", run_other_commands)
     with pytest.raises(BusError, match="enough"):
         sim_loop.sim_loop(load(None), 1.0, record=False, name="night")
     refusal, listed = found

@@ -1,4 +1,4 @@
-"""A night with the loop: every command of docs/howto/operating.md, and its programs, against real processes."""
+"""A night with the loop: every command and program of docs/howto/operating.md, run against real processes."""
 
 import contextlib
 import io
@@ -126,7 +126,7 @@ def _make_requests_beyond_the_document(night: Night) -> None:
         loop.close_loop()
         assert loop.play_offset(np.ones((5000, 14))).frame_sequence > first
         loop.stop()
-        for request, why in (
+        for request, reason in (
             (lambda: loop.gain(9.0), "becomes unstable"),
             (lambda: loop.offset(np.nan), "finite"),
             (lambda: loop.channel("Dark Hole", np.zeros(grid)), "letter first"),
@@ -135,7 +135,7 @@ def _make_requests_beyond_the_document(night: Night) -> None:
             (lambda: loop.ask("dance"), "unknown request 'dance'"),
             (lambda: loop.record(True), "already in progress"),
         ):
-            with pytest.raises(RequestRefusedError, match=why):
+            with pytest.raises(RequestRefusedError, match=reason):
                 request()
         with loop.reserved("a test", 30.0), Client(night.name) as other:
             with pytest.raises(RequestRefusedError, match=r"reserved for a test by .*, about \d+ s to go"):
@@ -162,7 +162,7 @@ def _make_requests_beyond_the_document(night: Night) -> None:
         night.outputs["runs"] = lowfc("runs", "--json").stdout
         return '"recording": "none"' not in night.outputs["runs"]
 
-    until(recorder_answered)  # a Health that comes late is missing in the list
+    until(recorder_answered)  # `runs` does not wait for a late Health of the recorder
     for command in ("lowfc ctl status --json", "lowfc ctl note once --json", "lowfc ctl configuration --json"):
         night.ctl(command)
     night.outputs["refused"] = refusal("ctl", "gain", "-0.1", "--modes", "2", "--run", night.name)
@@ -272,7 +272,7 @@ def test_the_night_is_replayed_to_the_bit(night: Night) -> None:
         commands += results["commands"]
     frames = night.results["frames_processed"]
     assert isinstance(frames, int)
-    assert commands > 0.6 * frames, "only those before the first state of a later log are not replayed"
+    assert commands > 0.6 * frames, "only the commands before the first controller state of a log are not replayed"
 
 
 @pytest.mark.slow

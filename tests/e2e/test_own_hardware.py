@@ -97,7 +97,7 @@ def conformance(folder: Path, *commands: str) -> None:
         assert results["device"] in line or results["device"] == "mirror-dm"
         assert results["counts"]["wrong"] == 0
         assert {"clear", "relaxing"}.isdisjoint(one["name"] for one in results["checks"] if one["status"] != "ok")
-        assert results["counts"]["ok"] >= len(results["checks"]) - 5  # warnings of a busy host
+        assert results["counts"]["ok"] >= len(results["checks"]) - 5  # a busy host causes warnings
 
 
 def test_the_loop_closes_with_a_users_camera_and_mirror(folder: Path) -> None:
@@ -184,13 +184,13 @@ class SmallCamera(MyCamera):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("own", [False, True])
-def test_a_loop_with_a_camera_of_another_size_is_commissioned(folder: Path, own: bool) -> None:
+@pytest.mark.parametrize("own_drivers", [False, True])
+def test_a_loop_with_a_camera_of_another_size_is_commissioned(folder: Path, own_drivers: bool) -> None:
     """docs/howto/commissioning.md, as written, and with a user's drivers: 64 x 64 pixels, 100 Hz, 14 bits."""
     assert len(COMMISSIONING) == 5
     (folder / "bench.toml").write_text(block("toml"))
     devices = PAGE_DEVICES
-    if own:
+    if own_drivers:
         (folder / "examples/small_camera.py").write_text(OWN_CAMERA)
         sim = "lowfc mirror sim", "lowfc camera sim --rows 64 --columns 64"
         drivers = "lowfc mirror examples/mirror.py:MyMirror", "lowfc camera examples/small_camera.py:SmallCamera"
@@ -200,10 +200,10 @@ def test_a_loop_with_a_camera_of_another_size_is_commissioned(folder: Path, own:
         with operator_bus() as bus:
             wait_for_devices(bus)
         process = started(folder, f"{COMMISSION} --json")
-        out, shown = process.communicate(timeout=400)
-        assert process.returncode == 0, shown
+        out, stderr = process.communicate(timeout=400)
+        assert process.returncode == 0, stderr
         for number in range(1, 11):
-            assert f"[{number}/10]" in shown
+            assert f"[{number}/10]" in stderr
         results = json.loads(out)
         assert results["recommended"]
         assert results["delay_frames"] == pytest.approx(1, abs=0.1)

@@ -66,9 +66,9 @@ class Night:
         health = self.loop.processes().get(name)
         return health is not None and health.state in ("ready", "running")
 
-    def end(self, name: str, how: signal.Signals = signal.SIGTERM) -> None:
+    def end(self, name: str, number: signal.Signals = signal.SIGTERM) -> None:
         process = self.running.pop(name)
-        process.send_signal(how)
+        process.send_signal(number)
         process.wait(20)
 
     def close(self) -> None:
@@ -85,7 +85,9 @@ def night(tmp_path: Path) -> Iterator[Night]:
     night.close()
 
 
-def test_operators_a_restart_dropped_frames_and_rotation(night: Night, tmp_path: Path) -> None:
+def test_logs_with_requests_a_restart_dropped_frames_and_rotation_are_replayed_identically(
+    night: Night, tmp_path: Path
+) -> None:
     night.start("mirror-dm", "controller", "recorder")
     night.start("camera")
     for _ in night.loop.steps(1, patience_s=20.0):

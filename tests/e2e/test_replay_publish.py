@@ -226,7 +226,9 @@ def test_invalid_options_are_refused(log: Path, run: Run, options: dict[str, Any
         ("controller", {"topics": ["lowfc/mirror/dm/command"], "allow_commands": True}),
     ],
 )
-def test_a_live_process_is_not_mixed_with_a_log(log: Path, run: Run, live: str, options: dict[str, Any]) -> None:
+def test_a_log_is_not_published_while_a_process_of_a_published_role_is_live(
+    log: Path, run: Run, live: str, options: dict[str, Any]
+) -> None:
     with socket.socket() as busy:
         busy.bind(("127.0.0.1", run.links.ports[live]))
         busy.listen()

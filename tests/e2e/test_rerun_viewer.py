@@ -24,7 +24,7 @@ from tests.support.report_log import SyntheticLog
 from tests.support.viewers import complaints, listening, on_screen, pixels, share_of
 
 ORANGE, BLUE = (214, 110, 20), (20, 90, 214)
-MIN_SHARE = 0.05  # fraction of the viewer's pixels with each colour of an image of two colours
+MIN_SHARE = 0.05  # least fraction of the viewer's pixels that have one of the two colours
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def web() -> Iterator[RerunViewer]:
 
 @on_screen
 def test_an_image_that_was_logged_is_on_the_screen(headless: RerunViewer, tmp_path: Path) -> None:
-    stream = _two_colours(headless)
+    stream = _send_two_colours(headless)
     path = tmp_path / "screen.png"
     picture = headless.screenshot(path)
     assert path.read_bytes() == picture
@@ -65,7 +65,7 @@ def test_a_picture_is_taken_although_the_viewer_abandons_a_query(
             raise faults.pop()
         return real_ask(viewer, question)
 
-    stream = _two_colours(headless)
+    stream = _send_two_colours(headless)
     monkeypatch.setattr(RerunViewer, "_ask", ask)
     assert headless.screenshot()
     assert not faults
@@ -103,15 +103,15 @@ def test_a_viewer_that_hangs_or_dies_is_noticed(web: RerunViewer) -> None:
 
 
 def test_a_new_viewer_on_the_same_port_takes_a_new_stream(web: RerunViewer) -> None:
-    before = _two_colours(web)
+    old_stream = _send_two_colours(web)
     os.kill(web.pid, signal.SIGSTOP)
     web.stop()
     assert not Path(f"/proc/{web.pid}").exists()
     web.stop()
     with RerunViewer(Show.WEB, port=web.port, web_port=web.web_port) as replacement:
         assert (replacement.url, replacement.web_address) == (web.url, web.web_address)
-        _two_colours(replacement).disconnect()
-    before.disconnect()
+        _send_two_colours(replacement).disconnect()
+    old_stream.disconnect()
 
 
 def test_a_stopped_viewer_dies_with_its_parent() -> None:
@@ -157,8 +157,8 @@ def test_the_content_security_policy_allows_this_host_only(web: RerunViewer) -> 
     assert addresses == {f"http://127.0.0.1:{web.port}"}, "without this policy, the page sends usage statistics"
 
 
-def _two_colours(viewer: RerunViewer) -> rr.RecordingStream:
-    """A stream that has sent an image, orange above blue; disconnect it before its viewer ends."""
+def _send_two_colours(viewer: RerunViewer) -> rr.RecordingStream:
+    """Send an image, orange above blue; returns its stream, which must be disconnected before the viewer ends."""
     stream = rr.RecordingStream("lowfc-test", recording_id="test")
     stream.connect_grpc(viewer.url)
     image = np.empty((80, 80, 3), np.uint8)

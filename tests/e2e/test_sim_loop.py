@@ -49,7 +49,7 @@ def test_the_residual_is_below_half_of_the_disturbance_and_every_frame_is_counte
         assert 0 < values["p50"] <= values["p99"] <= values["p99_9"] <= values["max"]
 
 
-def test_without_requests_the_log_holds_the_other_topics_and_counts_lost_messages(
+def test_the_log_holds_every_topic_that_needs_no_request_and_lost_messages_are_counted(
     live: dict[str, Any], topics: dict[str, list[bytes]]
 ) -> None:
     recorded = sum(map(len, topics.values()))
@@ -64,13 +64,14 @@ def test_without_requests_the_log_holds_the_other_topics_and_counts_lost_message
 
 def test_the_log_grows_at_the_estimated_rate(live: dict[str, Any]) -> None:
     info = json.loads(output_of(live["log"].parent, f"lowfc info {live['log']} --json"))
-    constant = sum(info["attachments"].values()) + info["topics"]["lowfc/calibration"]["bytes"]
-    growth = (info["bytes"] - constant) * 500 / FRAMES
-    assert bytes_per_s(load(None, {"camera.rate_hz": 500.0}), EVERYTHING) == pytest.approx(growth, rel=0.25)
+    constant_bytes = sum(info["attachments"].values()) + info["topics"]["lowfc/calibration"]["bytes"]
+    growth_bytes_per_s = (info["bytes"] - constant_bytes) * 500 / FRAMES
+    estimated_bytes_per_s = bytes_per_s(load(None, {"camera.rate_hz": 500.0}), EVERYTHING)
+    assert estimated_bytes_per_s == pytest.approx(growth_bytes_per_s, rel=0.25)
 
 
 def test_frame_step_command_and_state_can_be_joined(topics: dict[str, list[bytes]]) -> None:
-    """Each carries the frame's sequence, steps and commands also its time: the path of one frame can be followed."""
+    """Each message has the sequence of its frame; a step and a command also have the frame's time."""
     frames = {from_timestamp(RawImage.FromString(payload).timestamp) for payload in topics["/lowfc/camera/frame"]}
     steps = [wire.ControlStep.FromString(payload) for payload in topics["/lowfc/control/step"]]
     commands = {

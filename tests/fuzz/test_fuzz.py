@@ -1,4 +1,4 @@
-"""Every reader of external bytes, with damaged inputs: it raises only its errors, and does not crash, hang or leak."""
+"""Readers of external bytes, with damaged inputs: each raises only its declared errors, and does not hang or leak."""
 
 from contextlib import suppress
 

@@ -74,9 +74,9 @@ def test_functions_of_arrays_document_shapes_and_units(package: str) -> None:
         if isinstance(node, ast.FunctionDef):
             annotated = [each for each in (*node.args.args, *node.args.kwonlyargs) if each.annotation is not None]
             arrays = [each for each in annotated if ARRAYS.search(ast.unparse(each.annotation))]
-            words = f"{text} {parents_text} {' '.join(each.arg.rpartition('_')[2] for each in arrays)}"
-            if arrays and not (SHAPE.search(words) and UNIT.search(words)):
-                lacking.append((name, "shape" if not SHAPE.search(words) else "unit", [each.arg for each in arrays]))
+            searched = f"{text} {parents_text} {' '.join(each.arg.rpartition('_')[2] for each in arrays)}"
+            if arrays and not (SHAPE.search(searched) and UNIT.search(searched)):
+                lacking.append((name, "shape" if not SHAPE.search(searched) else "unit", [each.arg for each in arrays]))
     assert lacking == []
 
 

@@ -87,7 +87,7 @@ def is_pure(module: str) -> bool:
 
 
 def layer_faults(module: str, source: str) -> list[str]:
-    """Imports that point upward or sideways, and relative ones."""
+    """Imports that point upward or sideways, and relative imports."""
     own, faults = layer_of(module), []
     for name in imports_of(ast.parse(source)):
         if name.startswith("."):
@@ -121,8 +121,8 @@ def purity_faults(module: str, source: str) -> list[str]:
                 faults.append(f"uses {text}")
             if kind in ("np", "numpy") and attribute in NUMPY_FILES:
                 faults.append(f"uses {text}")
-        unseeded = isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in FROM_A_SEED[1:]
-        if unseeded and not (node.args or node.keywords):
+        takes_a_seed = isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in FROM_A_SEED[1:]
+        if takes_a_seed and not (node.args or node.keywords):
             faults.append(f"calls {ast.unparse(node)} without a seed")
     return [f"{module} {fault}" for fault in faults]
 

@@ -1,7 +1,7 @@
 """The wheel is complete, and the installed programs run the loop.
 
 The wheel is installed into its own virtual environment. Its dependencies are not installed again, since that would
-require the network: those of this environment are appended to the path.
+require the network: this environment's libraries are appended to the module search path.
 """
 
 import json
@@ -92,8 +92,8 @@ def test_version_is_the_same_everywhere() -> None:
 
 
 def test_installed_programs_run_the_loop(installed: Path, tmp_path: Path) -> None:
-    where = "import lowfc, sim_camera, sim_dm; print(lowfc.__file__, sim_camera.__file__, sim_dm.__file__)"
-    paths = succeed(installed / "python", "-c", where, folder=tmp_path).split()
+    script = "import lowfc, sim_camera, sim_dm; print(lowfc.__file__, sim_camera.__file__, sim_dm.__file__)"
+    paths = succeed(installed / "python", "-c", script, folder=tmp_path).split()
     assert all(Path(path).is_relative_to(installed.parent) for path in paths)
     assert succeed(installed / "lowfc", "--version", folder=tmp_path).strip() == lowfc.__version__
     assert {"lowfc", "sim-camera", "sim-dm"} <= {path.name for path in installed.iterdir()}

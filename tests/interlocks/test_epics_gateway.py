@@ -50,7 +50,7 @@ class Variables(dict[str, "Variables.Shared"]):
             self.posts: list[tuple[Any, int, str]] = []
 
         def post(self, value: Any, timestamp: float, severity: int, message: str) -> None:
-            """All arguments are required: p4p would keep those of the post before."""
+            """All arguments are required here: p4p would keep an omitted one from the previous post."""
             self.posts.append((np.asarray(value).tolist(), severity, message))
 
     def __init__(self) -> None:
@@ -77,7 +77,7 @@ class Variables(dict[str, "Variables.Shared"]):
 
 @pytest.fixture
 def pvs(monkeypatch: pytest.MonkeyPatch) -> Variables:
-    """Variables of a stand-in for p4p, which is imported in its place."""
+    """Variables of a stand-in for p4p; `import p4p` imports the stand-in."""
     variables = Variables()
     modules = {
         "p4p.client": {},
@@ -116,7 +116,7 @@ def variable(name: str, kind: Kind, put: Put | None = None) -> Variable:
 
 
 class Operation:
-    """A client's put, and how it ended: "" if it succeeded."""
+    """A client's put, and its error message: "" if it succeeded."""
 
     def __init__(self, value: Any) -> None:
         self.value = lambda: value

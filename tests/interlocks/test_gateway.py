@@ -76,7 +76,7 @@ CONFIG = """
 rate_hz = 200
 [gateway]
 port = {port}
-search = "127.0.0.1:{search}"
+search = "127.0.0.1:{search_port}"
 bench = {{ mask = "BENCH:MASK:MOVING" }}
 [[interlocks]]
 name = "mask"
@@ -168,15 +168,15 @@ def test_an_unreadable_step_does_not_replace_the_previous_one() -> None:
     hub, clock = MemoryHub(), FakeClock()
     steps = MemoryBus(hub, "controller", clock).publisher(STEP)
     watch = Watch(MemoryBus(hub, "operator", clock), clock)
-    error = {one.name: one for one in variables()}["error"].read
-    assert error is not None
-    assert error(watch.update(), {}).tolist() == []
+    read_error = {one.name: one for one in variables()}["error"].read
+    assert read_error is not None
+    assert read_error(watch.update(), {}).tolist() == []
     steps.put(wire.ControlStep(mode=wire.LOOP_MODE_CLOSED, error_nm=[1, 2], command_nm=[0, 0]).SerializeToString())
-    assert error(watch.update(), {}).tolist() == [1, 2]
+    assert read_error(watch.update(), {}).tolist() == [1, 2]
     steps.put(b"\xff")
-    assert error(watch.update(), {}).tolist() == [1, 2]
+    assert read_error(watch.update(), {}).tolist() == [1, 2]
     steps.put(wire.ControlStep(mode=wire.LOOP_MODE_CLOSED, command_nm=[1, 2]).SerializeToString())
-    assert error(watch.update(), {}).tolist() == []
+    assert read_error(watch.update(), {}).tolist() == []
 
 
 @pytest.mark.parametrize(
@@ -214,14 +214,14 @@ def ioc() -> Iterator[tuple[Process, int]]:
 @pytest.mark.exclusive
 def test_ioc_drives_an_interlock_and_scan_changes_a_gain(tmp_path: Path, ioc: tuple[Process, int]) -> None:
     pytest.importorskip("ophyd_async", reason="needs ophyd-async")
-    process, search = ioc
+    process, search_port = ioc
     (port,) = free_ports(1)
-    (tmp_path / "bench.toml").write_text(CONFIG.format(port=port, search=search))
+    (tmp_path / "bench.toml").write_text(CONFIG.format(port=port, search_port=search_port))
     options = ("--run", "epics", "--config", "bench.toml")
     with started(tmp_path, "sim-loop", *options, "--duration", "600", "--no-record") as loop:
         until(lambda: "epics" in running(), 60)
         with started(tmp_path, "gateway", "epics", *options) as gateway:
-            run_scan(loop, gateway, process, f"127.0.0.1:{port + 1} 127.0.0.1:{search}")
+            run_scan(loop, gateway, process, f"127.0.0.1:{port + 1} 127.0.0.1:{search_port}")
 
 
 def run_scan(loop: Process, gateway: Process, ioc: Process, addresses: str) -> None:

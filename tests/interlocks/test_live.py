@@ -14,7 +14,7 @@ from lowfc.contract.errors import BusError, RequestRefusedError
 from lowfc.contract.messages import BENCH, CONTROL_INPUT, FRAME, STEP, wire
 from tests.support.loops import FIXED, interrupt, output_of, started, until
 
-RATE_HZ = 100  # leaves a host with two cores time for the flood: at 500 Hz its publisher waits for a core instead
+RATE_HZ = 100  # leaves a host with two cores time for the flood: at 500 Hz the flood's publisher waits for a core
 FLIPS = 60
 MAX_AGE_S = 1
 FLOOD_HZ = 2000
@@ -40,8 +40,8 @@ when_old = "passes"
 
 
 @pytest.mark.exclusive
-def test_interlocks_with_changing_flooding_and_missing_values(tmp_path: Path) -> None:
-    """Values act within a period, a flood of values loses no frame, and an old value acts as a missing one."""
+def test_interlocks_act_on_values_within_a_period_and_a_flood_of_values_loses_no_frame(tmp_path: Path) -> None:
+    """A value older than its maximum age acts as a missing one."""
     (tmp_path / "night.toml").write_text(CONFIG)
     options = ("--json", "--config", "night.toml", "--run", RUN, "--duration", "600")
     with started(tmp_path, "sim-loop", *options) as process:
@@ -68,7 +68,7 @@ def _publish() -> None:
         loop.bench("shutter", "open")
         for number in range(FLIPS):  # some values fall between the same two frames
             for acts in (True, False):
-                time.sleep(rng.uniform(0, 7.5 / RATE_HZ))  # up to seven and a half frames
+                time.sleep(rng.uniform(0, 7.5 / RATE_HZ))  # up to seven and a half frame periods
                 if number % 5:
                     loop.bench("mask", acts)
                 else:
@@ -133,10 +133,10 @@ def _values_act_at_the_next_frame(log: Path) -> None:
     frames_ns = {one.sequence: one.publish_time_ns for one in messages if one.key == FRAME.key}
     steps = [wire.ControlStep.FromString(one.payload) for one in messages if one.key == STEP.key]
     obeyed = []
-    for value, after in pairwise(values):
+    for value, next_value in pairwise(values):
         acts = wire.BenchValue.FromString(value.payload).truth
         begun_ns = value.publish_time_ns + SECOND_NS // RATE_HZ
-        between = [step for step in steps if begun_ns < frames_ns[step.frame_sequence] < after.publish_time_ns]
+        between = [step for step in steps if begun_ns < frames_ns[step.frame_sequence] < next_value.publish_time_ns]
         obeyed += [
             (wire.REASON_HELD in step.reasons) is (acts and step.mode == wire.LOOP_MODE_CLOSED) for step in between[:1]
         ]
