@@ -28,7 +28,7 @@ SMALL = Size(side=32, modes=5, mirror_side=10)
 
 
 def by_heading(lines: runner.Lines) -> list[dict[str, str]]:
-    """Each line as a dictionary by heading, last column first; the first of several columns with one heading counts."""
+    """Each line as a dictionary by heading, last column first; of columns with the same heading, the first counts."""
     assert len({len(line) for line in lines}) == 1
     return [dict(reversed(list(zip(lines[0], line, strict=True)))) for line in lines[1:]]
 
@@ -115,13 +115,13 @@ def test_a_loop_of_any_size_runs_without_an_optical_model() -> None:
     assert found["frames_without_command"] < found["frames"]
 
 
-def repeat(step_us: float, without: int = 0, failure: str = "") -> dict[str, Any]:
+def repeat(step_us: float, without_command: int = 0, failure: str = "") -> dict[str, Any]:
     alone = {"step_us": step_us, "stream_us": 10.0, "products_us": 15.0}
     results: dict[str, Any] = {name: {"p50": us, "p99": 2 * us, "cpu": us} for name, us in alone.items()}
     if failure:
         return results | {"failure": failure}
     results |= {"frame_to_command_us": {"p50": 200.0, "p99": 400.0}, "echo_us": {"p50": 50.0, "p99": 60.0}}
-    return results | {"frames": 100, "frames_without_command": without}
+    return results | {"frames": 100, "frames_without_command": without_command}
 
 
 def curves_result() -> dict[str, Any]:
@@ -291,9 +291,9 @@ def parsed(*arguments: str | Path) -> Namespace:
     return parser.parse_args(list(map(str, arguments)))
 
 
-def run_result(p50: float, p99: float, without: int = 0) -> dict[str, Any]:
+def run_result(p50: float, p99: float, without_command: int = 0) -> dict[str, Any]:
     span = {"p50": p50, "p99": p99, "p99_9": 2 * p99, "max": 3 * p99}
-    counts = {"frames": 1000, "without_command": without, "sent_late": 0, "command_error": 1e-6}
+    counts = {"frames": 1000, "without_command": without_command, "sent_late": 0, "command_error": 1e-6}
     return counts | {"frame_to_command": span, "frame_to_mirror": None}
 
 
@@ -347,8 +347,8 @@ def test_the_tables_have_ranges_differences_within_a_turn_and_missing_implementa
     assert list(against.values()) == ["1 of 2", "1 of 2", "-60 (-240 to +120)", "+20 (-6 to +45)", "C chain"]
     assert [line["implementation"] for line in features] == list(runs)
     about = comparison.about(result)
-    for words in ("CLOCK_MONOTONIC", "get it", "it fell", "refused: that", "SCHED_FIFO 50"):
-        assert words in about
+    for expected in ("CLOCK_MONOTONIC", "get it", "it fell", "refused: that", "SCHED_FIFO 50"):
+        assert expected in about
 
 
 def test_a_missing_implementation_is_reported_with_a_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -377,13 +377,15 @@ def test_the_step_is_an_integrator_with_a_leak(tmp_path: Path) -> None:
     "chosen", [pytest.param(one, id=one.name, marks=[pytest.mark.slow] * bool(one.kernel)) for one in IMPLEMENTATIONS]
 )
 def test_a_real_run_of_an_implementation_gives_its_latencies(chosen: implementations.Implementation) -> None:
-    """The C chain if ISIO_DIR is a checkout of ImageStreamIO, pyrtcao if PYRTCAO_PYTHON has it."""
+    """The C chain is run if ISIO_DIR is a checkout of ImageStreamIO, pyrtcao if PYRTCAO_PYTHON has it."""
     seconds, rate_hz = 0.5, 200.0
     options = parsed("--seconds", str(seconds), "--rate", str(rate_hz), "--warm-up", "10")
     if why := implementations.missing(chosen, options):
         pytest.skip(why)
     found = comparison.one_run(chosen, options, 0)
-    assert found["frames"] == pytest.approx(seconds * rate_hz, abs=10)  # the warm-up of lowfc is a time
+    assert found["frames"] == pytest.approx(
+        seconds * rate_hz, abs=10
+    )  # lowfc's warm-up is a time, not a number of frames
     assert found["without_command"] < found["frames"]
     to_command, to_mirror = found["frame_to_command"], found["frame_to_mirror"]
     assert 0 < to_command["p50"] <= to_command["p99"] <= to_command["max"]

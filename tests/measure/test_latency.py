@@ -42,7 +42,7 @@ from tests.support.loops import json_of, lowfc, refusal, until
 from tools.law_bench import calibrated
 
 START = 1_700_000_000 << 32  # sequence of the first frame
-MS = 1_000_000
+MS_NS = 1_000_000
 RATE_HZ, SECONDS = 200, 0.5
 HISTORY = Path(__file__).parents[2] / "benchmarks" / "history"
 
@@ -59,7 +59,7 @@ def frames(
 
     They are commanded after `command_us` (NaN: never) and applied 50 us later, except those in `mirror_lost`.
     """
-    put_ns = np.arange(put_ns) * MS if isinstance(put_ns, int) else put_ns
+    put_ns = np.arange(put_ns) * MS_NS if isinstance(put_ns, int) else put_ns
     sequence = START + np.arange(put_ns.size, dtype=np.uint64)
     command_ns = np.broadcast_to(np.asarray(command_us) * 1e3, put_ns.shape)
     timed = np.isfinite(command_ns)
@@ -121,7 +121,7 @@ def test_statistics_leave_the_warm_up_out_and_count_missing_commands_and_states(
 
 
 def test_frames_without_command_are_counted_as_crowded_out_only_in_a_burst() -> None:
-    put_ns = np.arange(1000) * MS
+    put_ns = np.arange(1000) * MS_NS
     due_ns = put_ns.copy()
     put_ns[800] = put_ns[802] - 2000  # two frames of a stalled source, late, just before the next one
     put_ns[801] = put_ns[802] - 1000
@@ -178,8 +178,11 @@ def test_repeats_are_combined_as_medians_with_their_range() -> None:
 def trace(
     wakings: int = 1000, late_us: Mapping[int, float] | None = None, steps: Mapping[str, tuple[int, int]] | None = None
 ) -> Trace:
-    """Trace of a bare loop with frames 1 ms apart; some wakings are late, some counts rise by an amount at a waking."""
-    due_ns = np.arange(wakings) * MS + MS // 2
+    """Trace of a bare loop with frames 1 ms apart.
+
+    `late_us`: lateness of some wakings, by index; `steps`: the waking at which a count rises, and by how much.
+    """
+    due_ns = np.arange(wakings) * MS_NS + MS_NS // 2
     woke_ns = due_ns + 20_000
     for index, late in (late_us or {}).items():
         woke_ns[index] = due_ns[index] + round(late * 1e3)
@@ -232,9 +235,9 @@ def test_a_stall_has_only_the_counts_of_its_own_time() -> None:
     command_us[[700, 800, 900, 950]] = 1500, 2000, 1200, 1100
     late_us = np.zeros(1000)
     late_us[900] = 800  # the stall starts when the frame is due, 0.8 ms before it is published
-    steps = {"stolen_ns": (701, 10 * MS), "waited_ns": (801, 1_200_000), "major_faults": (899, 3)}
+    steps = {"stolen_ns": (701, 10 * MS_NS), "waited_ns": (801, 1_200_000), "major_faults": (899, 3)}
     traces = {"camera": trace(late_us={600: 2200}), "controller": trace(steps=steps)}
-    found = stalls_of(frames(command_us=command_us, late_us=late_us), MS, traces)
+    found = stalls_of(frames(command_us=command_us, late_us=late_us), MS_NS, traces)
     assert [(stall.second, stall.held_up_by, stall.signs) for stall in found.stalls] == [
         (0.6, "host", "camera: bare loop 2200 us late"),
         (0.601, "host", "camera: bare loop 2200 us late"),
@@ -251,7 +254,7 @@ def test_a_stall_has_only_the_counts_of_its_own_time() -> None:
     ]
     both = combine([repeat(100, stalls=found), repeat(100, stalls=found)])["stalls"]
     assert (both["stalled"], len(both["stalls"]), both["bare"][0]["stalled"]) == (12, 12, 4)
-    quiet = stalls_of(frames(), MS, {"camera": trace(0)})
+    quiet = stalls_of(frames(), MS_NS, {"camera": trace(0)})
     assert (quiet.stalled, quiet.bare[0].late_us) == (0, None)
 
 
@@ -310,7 +313,7 @@ def test_the_step_alone_uses_every_prepared_frame() -> None:
     assert RawImage.FromString(payload) == image(pixels[1], 123, "lowfc_camera")
     clock = HostClock()
     step = ControlStep(config, calibration, clock.host_ns())
-    timer_ns, paced_ns = time_alone(step, payloads, clock, 0.1, MS)
+    timer_ns, paced_ns = time_alone(step, payloads, clock, 0.1, MS_NS)
     no_timer_ns, hot_ns = time_alone(step, payloads, clock, 0.05, None)
     assert 0 < timer_ns.size == paced_ns.size <= 101
     assert no_timer_ns.size == 0
@@ -341,8 +344,8 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
 def test_every_frame_of_a_real_loop_is_counted(measured: tuple[dict[str, Any], Path]) -> None:
     results, folder = measured
     text = table(results)
-    for words in ("frame to command", "due to command", "half a bare echo", "timer wake-up", "without a command"):
-        assert words in text
+    for label in ("frame to command", "due to command", "half a bare echo", "timer wake-up", "without a command"):
+        assert label in text
     assert (folder / "latency.png").read_bytes().startswith(b"\x89PNG")
     sent = round(RATE_HZ * (SECONDS + WARM_UP_S))
     assert results["frames"] + results["warm_up_frames"] == sent

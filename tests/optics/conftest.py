@@ -60,7 +60,7 @@ def hcipy():
 
 @pytest.fixture(scope="session")
 def prysm():
-    """Another independent diffraction code; prysm 0.21 imports pkg_resources, which setuptools no longer has."""
+    """prysm, another independent diffraction code; version 0.21 imports pkg_resources, which setuptools has no more."""
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         stand_in = SimpleNamespace(get_distribution=importlib.metadata.distribution)

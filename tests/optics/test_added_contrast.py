@@ -53,7 +53,7 @@ def test_spherical_adds_thousands_of_times_more_contrast_than_tilt(form: Array) 
     assert each.argmax() == NOLL.index(11)
 
 
-def test_contrast_of_tilt_is_that_of_a_dark_zone_sampled_far_more_finely(shaped: Coronagraph, form: Array) -> None:
+def test_contrast_of_tilt_agrees_with_a_dark_zone_sampled_far_more_finely(shaped: Coronagraph, form: Array) -> None:
     axis = 2 * pupil_axis(len(shaped.pupil))
     tilt_nm = zernikes((2,), axis, axis[:, None])[0]
     flat, plus, minus = (mean_contrast(shaped, a * tilt_nm, WAVELENGTH_NM, DARK_ZONE, 16) for a in (0.0, 1.0, -1.0))
@@ -61,15 +61,15 @@ def test_contrast_of_tilt_is_that_of_a_dark_zone_sampled_far_more_finely(shaped:
 
 
 def test_form_without_negative_eigenvalues_differs_little(form: Array) -> None:
-    loss = without_negative(form)
-    assert np.linalg.eigvalsh(loss).min() > -1e-20
-    assert np.linalg.norm(loss - form) < 1e-3 * np.linalg.norm(form)
+    semidefinite = without_negative(form)
+    assert np.linalg.eigvalsh(semidefinite).min() > -1e-20
+    assert np.linalg.norm(semidefinite - form) < 1e-3 * np.linalg.norm(form)
 
 
 def test_contrast_is_summed_by_group_and_large_tilt_is_beyond_quadratic(
     shaped: Coronagraph, added_in_image: AddedInImage
 ) -> None:
-    """The cross term of two modes is included in the sum: half of it for each."""
+    """The cross term of two modes is included in the sum, half of it in each mode."""
     modal, coma, tilt = ModalContrast(shaped, NOLL, WAVELENGTH_NM), NOLL.index(8), NOLL.index(2)
     shape = np.zeros(len(NOLL))
     shape[[coma, coma - 1, tilt]] = 0.3

@@ -32,10 +32,10 @@ def test_lyot_image_agrees_with_hcipy(hcipy, coronagraph, modes, modes_nm):
 
     pupil_grid, mask_grid = hcipy.make_pupil_grid(512, 1.0), focal_grid(len(lyot.opaque), lyot.samples_per)
     passed = hcipy.Field(1.0 - lyot.opaque.ravel(), mask_grid)
-    theirs = hcipy.LyotCoronagraph(pupil_grid, passed, hcipy.Field(lyot.stop.ravel(), pupil_grid))
+    hcipy_lyot = hcipy.LyotCoronagraph(pupil_grid, passed, hcipy.Field(lyot.stop.ravel(), pupil_grid))
     camera = hcipy.FraunhoferPropagator(pupil_grid, focal_grid(samples, 4))
     field = (coronagraph.pupil * np.exp(2j * np.pi / WAVELENGTH_NM * opd_nm)).ravel()
-    behind = theirs.forward(hcipy.Wavefront(hcipy.Field(field, pupil_grid)))
+    behind = hcipy_lyot.forward(hcipy.Wavefront(hcipy.Field(field, pupil_grid)))
     star = hcipy.Wavefront(hcipy.Field((coronagraph.pupil * lyot.stop).ravel() + 0j, pupil_grid))
     peak = np.abs(star.electric_field.sum() / 512**2) ** 2
     expected = np.asarray(camera.forward(behind).intensity).reshape(samples, samples) / peak
@@ -56,7 +56,10 @@ def test_fast_image_and_quadratic_form_agree_with_the_exact_image(coronagraph, m
 
 @pytest.mark.parametrize(("coronagraph", "ratio"), [("lyot", -39_000), ("aplc", 190)], indirect=["coronagraph"])
 def test_lyot_coronagraphs_are_far_more_sensitive_to_tilt_than_a_shaped_pupil(coronagraph, ratio):
-    """Tilt adds 190 times as much contrast with the APLC; with the classical mask it lowers that of the dark zone."""
+    """With the APLC, a tilt adds 190 times as much contrast as with the shaped pupil.
+
+    With the classical mask, a tilt lowers the contrast of the dark zone.
+    """
     shaped = coronagraph_from(SensorSection())
     lyot_form, shaped_form = (contrast_form(one, (2,), WAVELENGTH_NM).item() for one in (coronagraph, shaped))
     assert shaped_form > 0

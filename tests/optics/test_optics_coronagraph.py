@@ -131,9 +131,9 @@ CASES = {
     "flat": wavefront(),
     "tilt of 14 mas": wavefront(Z2=TILT_NM, Z3=-TILT_NM),
     "focus and coma": wavefront(Z4=WAVELENGTH_NM / 30, Z7=WAVELENGTH_NM / 30),
-    "1 nm each": RANDOM.normal(0, 1.0, 14),
-    "5 nm each": RANDOM.normal(0, 5.0, 14),
-    "20 nm each": RANDOM.normal(0, 20.0, 14),
+    "about 1 nm in each mode": RANDOM.normal(0, 1.0, 14),
+    "about 5 nm in each mode": RANDOM.normal(0, 5.0, 14),
+    "about 20 nm in each mode": RANDOM.normal(0, 20.0, 14),
 }
 
 

@@ -47,16 +47,16 @@ def test_noise_table_has_the_exact_distribution_at_its_levels(camera):
 @pytest.mark.parametrize("mean_e", [0.0, 0.5 * STEP_E, 0.05, 1.3, 5.03, 13.0, FAINT_E - 0.01, FAINT_E, 60.0])
 def test_a_million_pixels_pass_the_chi_square_test(camera, mean_e):
     """Means at levels of the table, between its levels, and above the table."""
-    count, least = 1_000_000, 10
+    count, min_expected = 1_000_000, 10
     frame = expose(camera, flat(mean_e, 1000), rng())
     numbers = np.arange(400)
     expected = count * probabilities(camera, float(np.float32(mean_e)), numbers)
     found = np.bincount(frame.ravel(), minlength=400)
-    often = expected > least  # all other numbers form one class
-    expected = np.append(expected[often], max(count - expected[often].sum(), least))
+    often = expected > min_expected  # all other numbers form one class
+    expected = np.append(expected[often], max(count - expected[often].sum(), min_expected))
     found = np.append(found[often], found[~often].sum())
     assert scipy.stats.chi2.sf(np.sum((found - expected)[:-1] ** 2 / expected[:-1]), often.sum() - 1) > 1e-3
-    assert found[-1] < 10 * least
+    assert found[-1] < 10 * min_expected
 
 
 def test_an_exact_camera_has_no_table_and_the_same_mean_and_variance():
@@ -96,7 +96,7 @@ def test_clock_induced_charge_is_multiplied_like_light():
         (Detector(full_well_e=5000.0, em_gain=1000.0, bias_dn=0.0), 5000),
     ],
 )
-def test_saturation_is_full_well_or_the_converter(camera, limit):
+def test_saturation_is_at_the_full_well_or_at_the_limit_of_the_converter(camera, limit):
     assert saturation_dn(camera) == limit
     frame = expose(camera, flat(1e8, 8), rng())
     assert frame.dtype == np.uint16
@@ -141,7 +141,7 @@ def test_invalid_detectors_and_photometry_are_refused(kind, bad):
         kind(**bad)
 
 
-def test_photometry_agrees_with_section_3_3():
+def test_photometry_agrees_with_section_3_3_of_the_paper():
     assert electrons(Photometry(), 0.05) == pytest.approx(8.12e6, rel=1e-3)
     assert electrons(Photometry(magnitude=2.33), 0.05) == pytest.approx(10 * electrons(Photometry(), 0.05))
     assert electrons(Photometry(), 0.1) == pytest.approx(2 * electrons(Photometry(), 0.05))
@@ -149,4 +149,4 @@ def test_photometry_agrees_with_section_3_3():
 
 def test_a_milliarcsecond_of_tilt_is_2_4_nm_rms_with_a_telescope_of_2_m():
     assert tilt_nm_per_mas(2.0) == pytest.approx(2.424, abs=1e-3)
-    assert 4 * tilt_nm_per_mas(2.0) / 550 == pytest.approx(0.0176, abs=1e-4)  # waves peak to valley, Sect. 3.3
+    assert 4 * tilt_nm_per_mas(2.0) / 550 == pytest.approx(0.0176, abs=1e-4)  # waves P-V, Sect. 3.3 of the paper

@@ -143,7 +143,7 @@ def test_missing_files_misspelt_names_and_impossible_values_are_refused():
         check_files(load(None, {"sensor.pupil": "circle", "sensor.lyot_stop": 0.001}))
 
 
-def test_the_dark_zone_of_a_pupil_file_is_that_of_its_request(tmp_path):
+def test_the_dark_zone_of_a_pupil_file_is_the_one_it_was_designed_for(tmp_path):
     path = tmp_path / "pupil.npz"
     section, quarter = SensorSection(pupil=str(path)), np.ones((2, 2))
     np.savez(path, quarter=quarter, made_by=json.dumps({"inner": 3.0, "outer": 8.0, "half_angle_deg": 30.0}))

@@ -84,13 +84,13 @@ def test_broadband_images_and_responses_are_weighted_sums(name, modes, opd_nm):
 
 def test_three_gauss_legendre_wavelengths_beat_the_papers_five(sensor):
     truth = reference(sensor, gauss_legendre(550.0, count=9))
-    three = relative_l2(reference(sensor, gauss_legendre(550.0)), truth)
-    five = relative_l2(reference(sensor, uniform(550.0)), truth)
-    assert three < 2.5e-3
-    assert five > 20 * three
+    error_of_three = relative_l2(reference(sensor, gauss_legendre(550.0)), truth)
+    error_of_five = relative_l2(reference(sensor, uniform(550.0)), truth)
+    assert error_of_three < 2.5e-3
+    assert error_of_five > 20 * error_of_three
 
 
-def test_bands_have_the_wavelengths_of_section_3_3():
+def test_bands_have_the_wavelengths_of_section_3_3_of_the_paper():
     np.testing.assert_allclose(uniform(550.0).wavelengths_nm, [495, 522.5, 550, 577.5, 605])
     assert sum(gauss_legendre(550.0).weights) == pytest.approx(1)
     np.testing.assert_allclose(np.dot(gauss_legendre(550.0).wavelengths_nm, gauss_legendre(550.0).weights), 550)
@@ -152,7 +152,7 @@ def test_six_millimetres_are_3_4_waves_of_defocus():
 def test_the_defocused_image_agrees_with_hcipy(hcipy, opd_nm, wavelength_nm):
     """Lengths are in lambda0/D, and the wavelength is small, so that hcipy's propagation is paraxial.
 
-    Its window is periodic, which changes the scale by up to 1e-3.
+    hcipy's window is periodic, which changes the scale of the intensity by up to 1e-3.
     """
     optics = sensor_named("clowfs")
     samples, small_wavelength = 512, 1e-3
@@ -170,7 +170,7 @@ def test_the_defocused_image_agrees_with_hcipy(hcipy, opd_nm, wavelength_nm):
 
 @pytest.mark.parametrize("defocus_mm", [1.5, 6.0])
 def test_defocused_image_agrees_with_a_quadratic_phase_in_the_relay_pupil(opd_nm, defocus_mm):
-    """The Fresnel integral by the angular spectrum, over all frequencies that the samples resolve."""
+    """Expected: the Fresnel integral, by the angular spectrum over all frequencies that the samples resolve."""
     optics = sensor_from(SensorSection(kind="clowfs", defocus_mm=defocus_mm))
     x, u = image_axis(64, 8), image_axis(4096, 512)  # 8 D of relay pupil
     window = np.cos(np.clip((np.abs(u) - 3.0) * np.pi / 2, 0, np.pi / 2)) ** 2  # its rim sends no light to the detector
@@ -272,7 +272,7 @@ def test_another_wavelength_is_equivalent_to_scaled_hardware(name):
     np.testing.assert_allclose(ours, reference(scaled), rtol=1e-9, atol=1e-15)
 
 
-def test_the_papers_defocus_has_a_better_condition_number_than_a_third_or_twice_of_it(modes):
+def test_the_papers_defocus_has_a_better_condition_number_than_a_third_and_twice_that_defocus(modes):
     def condition(defocus_mm):
         optics = sensor_from(SensorSection(kind="clowfs", defocus_mm=defocus_mm))
         return np.linalg.cond(response(optics, modes[:14]))

@@ -98,7 +98,7 @@ def test_twin_of_every_sensor_agrees_with_the_full_chain(spec, name, limit, mode
 
 @pytest.mark.parametrize(
     ("defocus_mm", "limit"),
-    [(3.0, 5e-5), *(pytest.param(*far, marks=pytest.mark.slow) for far in ((1.5, 2e-4), (12.0, 5e-5)))],
+    [(3.0, 5e-5), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((1.5, 2e-4), (12.0, 5e-5)))],
 )
 def test_defocused_twin_is_accurate_at_several_distances(defocus_mm, limit, modes, coefficients_nm):
     sensor = sensor_from(SensorSection(kind="clowfs", defocus_mm=defocus_mm))
@@ -173,13 +173,13 @@ def test_mirror_on_the_nodes_gives_the_commanded_wavefront(sensor, fast):
     commands = modes_to_actuators(Mirror(), NOLLS_20)
     for command, mode in zip(commands.T, zernikes(NOLLS_20, *node_radii(fast)), strict=True):
         error = wavefront_nm(on_nodes, 10.0 * command.reshape(34, 34)) - 10.0 * mode
-        assert wavefront_rms_nm(fast, error) < 0.35  # the fit by influence functions leaves up to 0.16 nm of it
+        assert wavefront_rms_nm(fast, error) < 0.35  # of which the fit by influence functions leaves 0.16 nm
     pokes_nm = poke_wavefronts_nm(on_nodes) @ commands
     for command, wavefront in zip(commands.T, pokes_nm.T, strict=True):
         np.testing.assert_allclose(wavefront, wavefront_nm(on_nodes, command.reshape(34, 34)), atol=1e-5)
 
 
-def test_rms_is_taken_over_the_open_pupil_without_piston(sensor, modes, fast):
+def test_rms_is_over_the_open_pupil_and_without_piston(sensor, modes, fast):
     open_pupil = sensor.pupil > 0.5
     at_nodes = zernikes(NOLLS_20, *node_radii(fast))
     for k in (0, 1, 2, 9):

@@ -153,7 +153,7 @@ def test_concurrent_builds_give_one_valid_file(sensor, tmp_path):
     assert_same(twins[0], load_or_build(sensor, SMALL, cache_dir=tmp_path, progress=forbidden, notice=forbidden))
 
 
-def test_the_cache_follows_xdg(monkeypatch, tmp_path):
+def test_the_cache_is_in_the_users_xdg_cache_folder(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert default_cache_dir() == tmp_path / "lowfc"
     monkeypatch.delenv("XDG_CACHE_HOME")

@@ -72,7 +72,7 @@ def test_a_refused_step_or_an_interrupt_ends_the_loop(
     record = "Path('pid').write_text(str(os.getpid())); print('begun', flush=True); Path('ready').touch()"
     (tmp_path / "silent.py").write_text(f"{begin}\n{record}\ntime.sleep(600)\n")
 
-    def refuse(_):
+    def fail(_):
         monkeypatch.setattr(dark_hole, "PATIENCE_S", patience_s)
         raise fault
 
@@ -80,7 +80,7 @@ def test_a_refused_step_or_an_interrupt_ends_the_loop(
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(dark_hole, "running", lambda: ["run"] * (tmp_path / "ready").exists())
     monkeypatch.setattr(dark_hole, "new_run_id", lambda: "run")
-    monkeypatch.setattr(dark_hole, "Client", refuse)
+    monkeypatch.setattr(dark_hole, "Client", fail)
     with pytest.raises(expected, match=message):
         dark_hole.dark_hole(tmp_path, 1.0)
     assert not Path("/proc", (tmp_path / "pid").read_text()).exists()

@@ -35,7 +35,7 @@ from tests.support.loops import json_of, lowfc, refusal
 
 DOCS = Path(__file__).parents[2] / "docs" / "measured"
 SAM = "sam27d07_bal14"
-FEW = 4
+FEW_TRIALS = 4
 RMS = "RMS residual, matched input"
 ESTIMATORS = ("pinv", "weighted", "weighted + 1 iteration", "weighted + 2 iterations")
 LIGHT = ("paper's electrons", "own photometry")
@@ -57,12 +57,16 @@ def committed():
 
 @pytest.fixture(scope="module")
 def few():
-    """Tables of one sensor with a few trials, and those without trials."""
-    with pytest.MonkeyPatch.context() as fewer:
-        fewer.setattr(conditioning, "BARS", ((0.1, 45.0),))
-        fewer.setattr(conditioning, "HOLES", (0.09, 0.05))
-        tables = run(("table1", "table2", "table3", "table4", "photometry"), Context(FEW, jobs=2, sensors=(SAM,)))
-        tables += run(["conditioning"], Context(FEW, jobs=2, sensors=("zwfs",)))  # bar and holes are aperture masks
+    """Tables of one sensor: with a few trials, or without trials if the table has none."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(conditioning, "BARS", ((0.1, 45.0),))
+        patch.setattr(conditioning, "HOLES", (0.09, 0.05))
+        tables = run(
+            ("table1", "table2", "table3", "table4", "photometry"), Context(FEW_TRIALS, jobs=2, sensors=(SAM,))
+        )
+        tables += run(
+            ["conditioning"], Context(FEW_TRIALS, jobs=2, sensors=("zwfs",))
+        )  # bar and holes are aperture masks
     return {table["table"]: table for table in tables}
 
 
@@ -85,7 +89,7 @@ def agree(measured, reference):
 
 
 def compare(found, committed):
-    """Assert that common rows agree; returns the keys that only one table has."""
+    """Assert that each row of both tables agrees; return the keys of the rows that only one table has."""
     rows = {key(row): row | {"trials": found["trials"]} for row in found["rows"]}
     references = {key(row): row | {"trials": committed["trials"]} for row in committed["rows"]}
     assert len(rows) == len(found["rows"]), "two rows with the same key"
@@ -114,7 +118,7 @@ def test_a_table_of_one_sensor_agrees_with_the_committed_one(few, committed, nam
     assert ("zwfs" in own) == (name in ("conditioning", "photometry"))
 
 
-def test_the_committed_conditioning_confirms_section_4(committed):
+def test_the_committed_conditioning_confirms_section_4_of_the_paper(committed):
     condition = {
         row["name"]: row["measured"]
         for row in committed["conditioning"]["rows"]
@@ -174,7 +178,7 @@ def test_the_command_prints_one_json_object():
 
 def test_a_layout_of_a_file_is_compared_with_the_paper(tmp_path, few):
     (tmp_path / "mask.json").write_text(SHIPPED.read_text())
-    (own,) = run(["table2"], Context(FEW, sensors=(f"{tmp_path}/mask.json:{SAM}",)))
+    (own,) = run(["table2"], Context(FEW_TRIALS, sensors=(f"{tmp_path}/mask.json:{SAM}",)))
     assert [row["paper"] for row in own["rows"]] == [row["paper"] for row in few["table2"]["rows"]]
 
 
@@ -286,7 +290,7 @@ def test_every_figure_agrees_with_the_committed_one(committed):
 
 
 FIGURE_DRAWS = {"fig1": REALISATIONS, "fig7": REALISATIONS, "fig9": SCREENS}
-"""Figures whose committed standard errors are from fewer draws than trials."""
+"""Number of draws of each figure whose committed standard errors are from fewer draws than trials."""
 
 
 def _unexplained(coefficient):

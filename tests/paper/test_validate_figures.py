@@ -53,7 +53,7 @@ def test_every_row_is_finite_and_states_its_assumptions(tables, figure):
 
 
 LAID_OUT = ("fig3", "fig6")
-"""Figures that quick tests lay out: few panels, of pictures and of curves. Layout takes half of the time of a plot."""
+"""Figures whose layout the quick tests compute, because they have few panels; layout takes half the time of a plot."""
 
 
 @pytest.mark.parametrize(
@@ -135,8 +135,8 @@ def test_correction_of_screens_approaches_the_best_fit_of_fourteen_modes(tables)
     for name in ("sam, cut from", "sam, periodic"):
         best = values(rows, "residual rms", "best possible fit", name)[0]
         assert 0.01 < best < 0.03
-        together = np.hypot(best, values(rows, "reconstructed rms", "best possible fit", name)[0])
-        assert together == pytest.approx(0.05, rel=0.03)  # squares add for each screen; these are means over screens
+        total_rms = np.hypot(best, values(rows, "reconstructed rms", "best possible fit", name)[0])
+        assert total_rms == pytest.approx(0.05, rel=0.03)  # squares add for each screen; these are means over screens
         assert all((row.limit is None) == (row.quantity != "residual rms") for row in rows)
         for estimator in ("pinv", "weighted", "weighted + 2 iterations"):
             assert best < values(rows, "residual rms", estimator, name)[0] < 2.5 * best
@@ -146,7 +146,7 @@ def test_the_signal_of_a_milliarcsecond_agrees_with_the_slope_of_the_image(table
     rows = tables["fig10"]
     ready = prepared("sam")
     u = 2 * pupil_axis(512)
-    tilt_nm = 1e-3 / 3600 * np.pi / 180 * 2.0 / 4 * 1e9 * 2 * np.broadcast_to(u, (512, 512))  # 2 m; Z2 = 2 u
+    tilt_nm = 1e-3 / 3600 * np.pi / 180 * 2.0 / 4 * 1e9 * 2 * np.broadcast_to(u, (512, 512))  # diameter 2 m
     np.testing.assert_allclose(ready.opd_nm(np.array([NM_PER_MAS, 0.0])), tilt_nm, atol=1e-3)
     slope = ready.band_tilt_H[:, 0] * NM_PER_MAS / ready.band_I0.max()
     assert values(rows, "P-V change of the image / its peak", name="sam, tilt x")[0] == pytest.approx(

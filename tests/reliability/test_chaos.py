@@ -39,7 +39,7 @@ CONFIG = load(None, {"mirror.rows": 12, "mirror.columns": 12})
 GRID = CONFIG.mirror.rows, CONFIG.mirror.columns
 
 
-def ns(index: int) -> int:
+def frame_ns(index: int) -> int:
     """Time of a frame, at 250 Hz."""
     return START_S * SECOND_NS + index * 4_000_000
 
@@ -47,7 +47,7 @@ def ns(index: int) -> int:
 def shape(index: int, height_nm: float = 0.0, start_s: int = START_S) -> Entry:
     surface = np.full(GRID, height_nm, np.float32)
     command = wire.MirrorCommand(input_number=index, frame_sequence=sequence_of(START_S, index))
-    return Entry(sequence_of(start_s, index), ns(index), command, surface)
+    return Entry(sequence_of(start_s, index), frame_ns(index), command, surface)
 
 
 def step(index: int, *reasons: int, used: bool = True, start_s: int = START_S) -> Entry:
@@ -58,19 +58,19 @@ def step(index: int, *reasons: int, used: bool = True, start_s: int = START_S) -
         reasons=reasons,
         error_nm=[1.0] if used else [],
     )
-    return Entry(sequence_of(start_s, index), ns(index), message)
+    return Entry(sequence_of(start_s, index), frame_ns(index), message)
 
 
 def truth(index: int, residual_nm: float) -> Entry:
-    return Entry(sequence_of(START_S, index), ns(index), wire.Truth(residual_rms_nm=residual_nm))
+    return Entry(sequence_of(START_S, index), frame_ns(index), wire.Truth(residual_rms_nm=residual_nm))
 
 
 def event(level: Level, text: str) -> Entry:
-    return Entry(sequence_of(START_S, 1), ns(1), Log(name="controller", level=level, message=text))
+    return Entry(sequence_of(START_S, 1), frame_ns(1), Log(name="controller", level=level, message=text))
 
 
 def received(*lost: int) -> Gaps:
-    """The gaps of a topic of which all messages but the lost ones were received."""
+    """Gaps of a topic; all messages were received except the lost ones."""
     gaps = Gaps(0)
     for number in range(FRAMES):
         if number not in lost:
@@ -88,7 +88,7 @@ def good_entries() -> dict[Topic, tuple[Entry, ...]]:
 @pytest.fixture
 def evidence(good_entries: dict[Topic, tuple[Entry, ...]]) -> Evidence:
     """Logs of a loop without a fault, four seconds long."""
-    evidence = Evidence(messages=5 * FRAMES, log_ends=[(ns(FRAMES), True)])
+    evidence = Evidence(messages=5 * FRAMES, log_ends=[(frame_ns(FRAMES), True)])
     for topic, entries in good_entries.items():
         evidence.entries[topic] = list(entries)
     evidence.received = {(0, key, START_S): received() for key in (FRAME.key, STEP.key)}
@@ -97,7 +97,7 @@ def evidence(good_entries: dict[Topic, tuple[Entry, ...]]) -> Evidence:
 
 @pytest.fixture
 def outcome(tmp_path: Path) -> Outcome:
-    outcome = Outcome(tmp_path, CONFIG, settled_ns=ns(300), end_ns=ns(FRAMES), mode=wire.LOOP_MODE_CLOSED)
+    outcome = Outcome(tmp_path, CONFIG, settled_ns=frame_ns(300), end_ns=frame_ns(FRAMES), mode=wire.LOOP_MODE_CLOSED)
     outcome.ended = [ProcessEnd("camera", 0, 0.1, True), ProcessEnd("controller", 0, 0.1, True)]
     return outcome
 
@@ -107,12 +107,12 @@ def broken_rules(case: Case, outcome: Outcome, evidence: Evidence) -> dict[str, 
 
 
 def unflushed(evidence: Evidence, outcome: Outcome) -> None:
-    outcome.killed_ns.append(ns(FRAMES))
-    evidence.log_ends.append((ns(500), False))
+    outcome.killed_ns.append(frame_ns(FRAMES))
+    evidence.log_ends.append((frame_ns(500), False))
 
 
-def ended(name: str, *how: object) -> Callable[[Evidence, Outcome], None]:
-    return lambda _, outcome: outcome.ended.append(ProcessEnd(name, *how))
+def ended(name: str, *details: object) -> Callable[[Evidence, Outcome], None]:
+    return lambda _, outcome: outcome.ended.append(ProcessEnd(name, *details))
 
 
 def refused(reason: int) -> Callable[[Evidence, Outcome], None]:
@@ -213,11 +213,13 @@ def test_the_time_to_recover_starts_with_the_first_frame_of_the_new_controller(
     assert recovered_s(outcome, evidence) is None
 
 
-def test_logs_are_read_with_their_losses_and_what_cannot_be_read(tmp_path: Path) -> None:
+def test_reading_the_logs_counts_losses_and_lists_what_cannot_be_read(tmp_path: Path) -> None:
     def log(name: str, finished: bool, *samples: tuple[Topic, bytes]) -> None:
         writer = LogWriter(tmp_path / name, 0, {})
         for number, (topic, payload) in enumerate(samples):
-            writer.write(Sample(topic.at("dm"), payload, sequence_of(START_S, number), ns(number), ns(number)))
+            writer.write(
+                Sample(topic.at("dm"), payload, sequence_of(START_S, number), frame_ns(number), frame_ns(number))
+            )
         if finished:
             writer.finish({"recording": {f"lost {STEP.key}": "3", "messages": "2"}})
         else:
@@ -347,8 +349,8 @@ def test_the_reason_why_a_command_fails_is_given() -> None:
 
 
 def test_a_shifted_clock_is_tried_with_the_shift_of_the_case(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The kernel refuses a monotonic clock below zero: an hour behind needs a host that has been up for an hour."""
-    monkeypatch.setattr("lowfc.programs.reliability.chaos.case.unmet", lambda *words: " ".join(words[-2:]))
+    """The kernel refuses a monotonic clock below zero: a clock an hour behind needs a host that is up for an hour."""
+    monkeypatch.setattr("lowfc.programs.reliability.chaos.case.unmet", lambda *arguments: " ".join(arguments[-2:]))
     assert [CASES[f"clock-{kind}"].why_skipped() for kind in ("ahead", "behind")] == ["3600 true", "-3600 true"]
 
 

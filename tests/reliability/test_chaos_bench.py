@@ -120,12 +120,12 @@ def test_a_slow_disk_delays_the_given_writes_and_no_others(tmp_path: Path, monke
     monkeypatch.setattr(sys, "argv", ["-c", *arguments])
     monkeypatch.setattr(time, "sleep", lambda seconds: waited.append((file.size, seconds)))
     with writer._File(tmp_path / "log", 0o600) as file:
-        exec(program, {})  # noqa: S102  # our own
+        exec(program, {})  # noqa: S102  # the program of `disk._on_slow_disk`
     assert waited == [(12, 3.0), (15, 3.0)]
     assert file.size == 30
 
 
-def test_a_camera_with_another_clock_is_replaced_by_one_with_the_hosts() -> None:
+def test_a_camera_with_another_clock_is_replaced_by_a_camera_with_the_hosts_clock() -> None:
     mock_bench = Mock(spec=ChaosBench, children={Role.CAMERA: SimpleNamespace(command=["sim-camera"])})
     CASES["clock-behind"].act(mock_bench)
     assert mock_bench.method_calls == [

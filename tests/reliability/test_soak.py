@@ -179,7 +179,7 @@ def test_missing_messages_are_counted_within_logs_and_between_them(tmp_path: Pat
 
 
 def test_a_soak_finds_the_process_whose_memory_grows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In simulated time, with a loop of the toy sensor that loses no message."""
+    """The loop with the toy sensor runs in simulated time and loses no message."""
 
     def new_bench(*arguments: Any) -> ToyBench:
         toy_bench = ToyBench(*arguments)

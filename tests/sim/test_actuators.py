@@ -39,17 +39,17 @@ def play(width_nm: float, heights_nm: list[float]) -> list[float]:
 
 def test_hysteresis_agrees_with_play_operators_and_encloses_their_area() -> None:
     """The hysteresis loop of a play of half width r for a swing of +-A has the area 4 r (A - r)."""
-    swing_nm, share = 80.0, 0.1
+    swing_nm, hysteresis = 80.0, 0.1
     cycle = swing_nm * np.sin(np.linspace(0, 2 * np.pi, 4001))
     heights = [*cycle, *cycle[1:]]
-    actuators = Actuators(GRID, 0, share, 0, 1)
+    actuators = Actuators(GRID, 0, hysteresis, 0, 1)
     reached = [float(actuators.reach(uniform(height), AT_ONCE)[0, 0]) for height in heights]
     plays = np.mean([play(width, heights) for width in PLAY_NM], axis=0)
-    np.testing.assert_allclose(reached, (1 - share) * np.array(heights) + share * plays, atol=1e-3)
+    np.testing.assert_allclose(reached, (1 - hysteresis) * np.array(heights) + hysteresis * plays, atol=1e-3)
     # The second of the two cycles; the first begins inside the loop.
     commanded_nm, reached_nm = np.array(heights[4000:]), np.array(reached[4000:])
     area = abs(np.sum((reached_nm[1:] + reached_nm[:-1]) / 2 * np.diff(commanded_nm)))
-    expected = share * np.mean([4 * width * max(swing_nm - width, 0) for width in PLAY_NM])
+    expected = hysteresis * np.mean([4 * width * max(swing_nm - width, 0) for width in PLAY_NM])
     assert area == pytest.approx(expected, rel=0.01)
 
 
@@ -58,8 +58,8 @@ def test_creep_grows_with_the_logarithm_of_time() -> None:
     actuators.reach(uniform(0), SETTLED)
     times_s = np.geomspace(1e-3, 1000, 600)
     reached = [float(actuators.reach(uniform(100), 1e9 * step_s)[1, 2]) for step_s in np.diff(times_s, prepend=0.0)]
-    for decade_s in (0.3, 1.0, 3.0):
-        grown = np.interp([decade_s, 10 * decade_s], times_s, reached)
+    for start_s in (0.3, 1.0, 3.0):
+        grown = np.interp([start_s, 10 * start_s], times_s, reached)
         assert np.diff(grown)[0] == pytest.approx(1.0, abs=0.06)
     assert reached[0] == pytest.approx(100, abs=0.05)
     assert reached[-1] == pytest.approx(104, abs=0.05)

@@ -63,7 +63,7 @@ def test_statistics_are_rms_over_frames_and_tilts_per_axis() -> None:
     assert not any([*found.values()][4:])
 
 
-def test_tilt_per_axis_is_that_of_the_axes_among_the_modes() -> None:
+def test_tilt_per_axis_counts_only_the_axes_among_the_modes() -> None:
     found = statistics(3.0, nm_per_mas=2.0, noll=(2,)).wavefront()
     assert (found["tilt_disturbance_mas"], found["tilt_residual_mas"]) == pytest.approx((3.0, 1.5))
 

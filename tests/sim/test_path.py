@@ -6,7 +6,7 @@ import pytest
 from sim_camera.path import MirrorPath
 
 FLAT, ONE, TWO = (np.full((2, 2), height, np.float32) for height in (0.0, 1.0, 2.0))
-"""Shapes of this height."""
+"""Shapes with all actuators at heights 0, 1 and 2."""
 INSTANTS = np.array([0.1, 0.5, 0.9])
 
 
@@ -47,7 +47,7 @@ def test_mirror_settles_exponentially_from_shape_to_shape() -> None:
 
 
 def test_instants_long_before_a_shape_do_not_overflow() -> None:
-    """As at 1 Hz, where the mirror settles within 5e-5 periods; a warning fails the test."""
+    """At 1 Hz the mirror settles within 5e-5 periods; a warning of an overflow fails the test."""
     path = MirrorPath(FLAT, settling=5e-5)
     path.applied(0.6, ONE)
     assert heights(path, 0) == [0, 0, 1]
@@ -64,7 +64,7 @@ def test_number_of_shapes_is_bounded(settling: float) -> None:
 
 
 def test_a_shape_with_an_earlier_time_than_the_previous_shape_applies_at_the_previous_time() -> None:
-    """As after a stall of the host, when frames restart: the weights of the shapes still sum to 1."""
+    """This happens after a stall of the host, when frames restart: the weights of the shapes still sum to 1."""
     path = MirrorPath(FLAT, settling=0.001)
     for moment, shape in ((0.7, ONE), (0.2, TWO), (0.75, ONE)):
         path.applied(moment, shape)

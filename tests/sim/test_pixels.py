@@ -60,7 +60,7 @@ def test_nonlinear_response_is_exact_at_zero_and_full_well() -> None:
 def test_scene_applies_pixel_errors_reproducibly() -> None:
     keys = {"camera.hot_pixels": 0.01, "camera.nonlinearity": 0.05, "camera.nonuniformity": 0.02, "camera.noise": False}
     bright = {"star.magnitude": 0.0, "disturbance.preset": "quiet"}
-    plain, one, same = (scene(load(None, bright | more)) for more in ({"camera.noise": False}, keys, keys))
+    plain, one, same = (scene(load(None, bright | other)) for other in ({"camera.noise": False}, keys, keys))
     ideal, real = plain.expose(0, FLAT), one.expose(0, FLAT)
     np.testing.assert_array_equal(real, same.expose(0, FLAT))
     errors = pixel_errors(DETECTOR, real.shape, 1, 0.02, 0.05, 0.01, 40.0)

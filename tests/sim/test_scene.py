@@ -136,7 +136,7 @@ def test_image_is_the_mean_over_its_exposure(exposure: float) -> None:
 )
 @pytest.mark.parametrize("rate_hz", [100.0, 20.0])
 def test_vibrations_faster_than_the_exposure_are_averaged(keys: dict[str, object], rate_hz: float) -> None:
-    """The sensed wavefront is the mean over 1000 instants, to 0.05 nm; the lines have 1 nm and more."""
+    """The sensed wavefront is the mean over 1000 instants, to 0.05 nm; the lines have amplitudes of 1 nm and more."""
     config = configured(camera__rate_hz=rate_hz, camera__exposure_fraction=1.0, **keys)
     truth = scene_of(config).truth(3, FLAT)
     expected = Sampler(disturbance_of(config), (np.arange(1000) + 0.5) / 1000, rate_hz).at(3).mean(axis=0)
@@ -152,7 +152,7 @@ def test_exposure_nodes_average_a_vibration_and_are_two_if_it_is_slow() -> None:
 
 @pytest.mark.slow
 def test_blurred_image_is_as_accurate_as_one_at_rest() -> None:
-    """The twin's two nodes against 64 images of the full optics: an error of at most 1.1 times that of one image."""
+    """The twin's two nodes against 64 images of the full optics: the error is at most 1.1 times the error at rest."""
     keys = {"disturbance__preset": "reaction-wheel-ideal", "camera__rate_hz": 1000.0}
     config = configured(**FINE, **keys)
     blurred, optics = scene_of(config), sensor(config, print)
@@ -191,7 +191,7 @@ def test_continuous_truth_is_the_rms_over_the_period_with_a_moving_mirror(calibr
 
 
 @pytest.mark.parametrize("instants", [1, 4])
-def test_truths_of_several_frames_are_those_of_each_frame(calibration: Calibration, instants: int) -> None:
+def test_truths_of_several_frames_equal_the_truth_of_each_frame(calibration: Calibration, instants: int) -> None:
     """Shapes recur within a frame and between frames, as those of a mirror that moves once per frame or not at all."""
     scene = scene_of(configured(disturbance__preset="kolmogorov", camera__instants=instants))
     first, second, third = (shape_of(calibration, nm * np.eye(MODES)[2]) for nm in (5.0, -8.0, 3.0))

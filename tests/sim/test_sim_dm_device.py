@@ -16,7 +16,7 @@ GRID = (4, 5)
 LIMITS = Limits(750.0, 150.0, 500.0)
 STEP_NM = 1500 / 2**16
 START_NS = 1_700_000_000_000_000_000
-MS = 1_000_000
+MS_NS = 1_000_000
 
 
 def mirror(**keys: object) -> Simulated:
@@ -26,7 +26,7 @@ def mirror(**keys: object) -> Simulated:
 
 
 def command(actuators_nm: Single | None, index: int = 1, **changes: object) -> Command:
-    valid = Command("lowfc", index, START_NS + index * MS, 200 * MS, actuators_nm, np.array([1, 2], np.float32))
+    valid = Command("lowfc", index, START_NS + index * MS_NS, 200 * MS_NS, actuators_nm, np.array([1, 2], np.float32))
     return valid._replace(**changes)
 
 
@@ -39,7 +39,7 @@ def follow(device: Simulated, status: Status, *heights_nm: float) -> Status:
     """Status after commands to these heights, which must be accepted."""
     for height_nm in heights_nm:
         index = status.frame_sequence + 1
-        status, refused = device.apply_command(status, command(uniform(height_nm), index), START_NS + index * MS)
+        status, refused = device.apply_command(status, command(uniform(height_nm), index), START_NS + index * MS_NS)
         assert refused is None
     return status
 
@@ -81,7 +81,7 @@ def test_command_with_a_time_in_the_far_future_still_times_out_to_flat() -> None
     ahead = command(uniform(100.0), time_ns=1 << 62)
     status, _ = device.apply_command(device.initial, ahead, START_NS)
     for number in range(1, 5):
-        status = device.tick(status, START_NS + MAX_VALID_NS + number * 10 * MS)
+        status = device.tick(status, START_NS + MAX_VALID_NS + number * 10 * MS_NS)
     assert not status.following
     assert not status.surface_nm.any()
 
@@ -95,7 +95,7 @@ commands = st.lists(
         hnp.arrays(np.float32, GRID, elements=values.map(np.float32)),
         hnp.arrays(np.float32, st.sampled_from([(5, 4), (1, 1), (20,)]), elements=values.map(np.float32)),
         st.none(),
-        st.integers(1, 3_000).map(lambda ms: ms * MS),  # time without commands
+        st.integers(1, 3_000).map(lambda ms: ms * MS_NS),  # time without commands
     ),
     max_size=12,
 )
@@ -104,11 +104,11 @@ commands = st.lists(
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(script=commands, bits=st.sampled_from([8, 10, 16, 24]))
 def test_surface_stays_within_the_limits_for_any_commands(script: list[object], bits: int) -> None:
-    """Also after rounding to the driver's steps, and when the command has expired."""
+    """This holds also after rounding to the driver's steps, and when the command has expired."""
     device = mirror(driver_bits=bits)
     status, now_ns = device.initial, START_NS
     for index, entry in enumerate(script):
-        now_ns += MS
+        now_ns += MS_NS
         if isinstance(entry, int):
             now_ns += entry
             after = device.tick(status, now_ns)
@@ -138,7 +138,7 @@ def test_mirror_at_the_neighbour_limit_does_not_oscillate() -> None:
     shape_nm[2:] = -740
     status = device.initial
     for index in range(1, 60):
-        status, _ = device.apply_command(status, command(shape_nm, index), START_NS + index * MS)
+        status, _ = device.apply_command(status, command(shape_nm, index), START_NS + index * MS_NS)
         if index == 30:
             settled = status.surface_nm
     assert neighbour_difference_nm(status.surface_nm) > LIMITS.neighbour_nm - 3 * 1500 / 2**8
@@ -150,10 +150,10 @@ def test_limits_of_the_mirror_are_reported_and_its_modal_command_is_then_empty()
     status, _ = device.apply_command(device.initial, command(uniform(100)), START_NS)
     assert status.limits_hit == ()
     assert status.command_nm.tolist() == [1, 2]
-    status, _ = device.apply_command(status, command(uniform(900), 2), START_NS + MS)
+    status, _ = device.apply_command(status, command(uniform(900), 2), START_NS + MS_NS)
     assert status.limits_hit == (Limit.STROKE, Limit.SLEW)
     assert status.command_nm.size == 0
-    status, _ = device.apply_command(status, command(uniform(300), 3), START_NS + 2 * MS)
+    status, _ = device.apply_command(status, command(uniform(300), 3), START_NS + 2 * MS_NS)
     assert status.limits_hit == ()
 
 
@@ -171,7 +171,7 @@ def test_limits_of_the_mirror_are_reported_and_its_modal_command_is_then_empty()
 def test_invalid_command_changes_nothing_and_does_not_restart_the_timeout(invalid: Command, reason: Reason) -> None:
     device = mirror()
     before = follow(device, device.initial, 10, 20, 30, 40, 50)
-    after, refused = device.apply_command(before, invalid, START_NS + 100 * MS)
+    after, refused = device.apply_command(before, invalid, START_NS + 100 * MS_NS)
     assert refused is reason
     assert after is before
 
@@ -179,15 +179,15 @@ def test_invalid_command_changes_nothing_and_does_not_restart_the_timeout(invali
 def test_repeated_command_renews_the_timeout() -> None:
     device = mirror()
     status = follow(device, device.initial, 10)
-    after, refused = device.apply_command(status, command(uniform(10), 1), START_NS + 150 * MS)
+    after, refused = device.apply_command(status, command(uniform(10), 1), START_NS + 150 * MS_NS)
     assert refused is None
-    assert after.received_ns == START_NS + 150 * MS
+    assert after.received_ns == START_NS + 150 * MS_NS
     assert np.array_equal(after.surface_nm, status.surface_nm)
 
 
 @pytest.mark.parametrize(
     ("valid_ns", "held_ns"),
-    [(200 * MS, 200 * MS), (2**64 - 1, MAX_VALID_NS), (0, 0)],
+    [(200 * MS_NS, 200 * MS_NS), (2**64 - 1, MAX_VALID_NS), (0, 0)],
     ids=["200 ms", "longest", "zero"],
 )
 def test_command_expires_just_after_its_validity(valid_ns: int, held_ns: int) -> None:
@@ -212,11 +212,11 @@ def test_command_expires_if_the_clock_goes_back() -> None:
 def test_expired_mirror_relaxes_to_flat_within_the_slew_limit_and_follows_again() -> None:
     device = mirror()
     status = follow(device, device.initial, 100, 200, 300, 400, 500)
-    now_ns = START_NS + 1_000 * MS
+    now_ns = START_NS + 1_000 * MS_NS
     heights = []
     for _ in range(6):
         status = device.tick(status, now_ns)
-        now_ns += 10 * MS
+        now_ns += 10 * MS_NS
         heights.append(float(status.surface_nm.max()))
     assert heights[0] == pytest.approx(350, abs=0.1)
     assert heights[3:] == [0, 0, 0]
@@ -230,7 +230,7 @@ def test_expired_mirror_relaxes_to_flat_within_the_slew_limit_and_follows_again(
 def test_expired_mirror_holds_its_shape_if_configured() -> None:
     device = mirror(on_command_timeout="hold")
     status = follow(device, device.initial, 50)
-    expired = device.tick(status, START_NS + 1_000 * MS)
+    expired = device.tick(status, START_NS + 1_000 * MS_NS)
     assert not expired.following
     assert np.array_equal(expired.surface_nm, status.surface_nm)
 
@@ -246,11 +246,11 @@ def test_channels_are_summed_and_the_sum_is_limited() -> None:
     status = device.initial
     for index, (channel, height_nm) in enumerate((("lowfc", 60), ("offset", -20), ("lowfc", 80)), start=1):
         sent = command(uniform(height_nm), index, channel=channel)
-        status, _ = device.apply_command(status, sent, START_NS + index * MS)
+        status, _ = device.apply_command(status, sent, START_NS + index * MS_NS)
     assert status.surface_nm.max() == pytest.approx(60, abs=STEP_NM)
     assert sorted(status.channels) == ["lowfc", "offset"]
-    status, _ = device.apply_command(status, command(uniform(3e38), 4, channel="lowfc"), START_NS + 4 * MS)
-    status, _ = device.apply_command(status, command(uniform(3e38), 5, channel="offset"), START_NS + 5 * MS)
+    status, _ = device.apply_command(status, command(uniform(3e38), 4, channel="lowfc"), START_NS + 4 * MS_NS)
+    status, _ = device.apply_command(status, command(uniform(3e38), 5, channel="offset"), START_NS + 5 * MS_NS)
     assert status.limits_hit == (Limit.NOT_FINITE,)
     assert np.abs(status.surface_nm).max() <= LIMITS.stroke_nm
 
@@ -264,7 +264,7 @@ def test_dead_and_stuck_actuators_stay_where_they_are() -> None:
     assert status.surface_nm[1, 1] == 123
     assert status.surface_nm[2, 2] == pytest.approx(100, abs=STEP_NM)
     for _ in range(5):
-        status = device.tick(status, START_NS + 1_000 * MS)
+        status = device.tick(status, START_NS + 1_000 * MS_NS)
     assert np.count_nonzero(status.surface_nm) == 1
     assert status.surface_nm[1, 1] == 123
 
@@ -275,9 +275,9 @@ def test_settling_is_a_first_order_response() -> None:
     status, _ = device.apply_command(device.initial, command(uniform(0), 1), START_NS)
     status, _ = device.apply_command(status, command(uniform(100), 2), START_NS)
     assert status.surface_nm.max() == pytest.approx(100 * (1 - np.exp(-1)), abs=STEP_NM)
-    status = device.tick(status, status.time_ns + 2 * MS)
+    status = device.tick(status, status.time_ns + 2 * MS_NS)
     assert status.surface_nm.max() == pytest.approx(100 * (1 - np.exp(-3)), abs=STEP_NM)
-    status = device.tick(status, status.time_ns + 21 * MS)
+    status = device.tick(status, status.time_ns + 21 * MS_NS)
     assert status.surface_nm.max() == pytest.approx(100, abs=STEP_NM)
 
 
@@ -289,12 +289,12 @@ def test_command_with_an_older_time_does_not_move_the_surface_back() -> None:
 
 
 def test_commands_of_the_same_frame_move_the_surface_within_the_slew() -> None:
-    """Frame timeout: the controller relaxes the mirror with commands that all have the last frame's time."""
+    """After a frame timeout, the controller relaxes the mirror with commands that all have the last frame's time."""
     device = mirror(settling_us=1000.0)
     status = follow(device, device.initial, 100, 200, 300)
     for number, height_nm in enumerate((200, 100, 0), start=1):
         before = status.surface_nm
-        now_ns = status.received_ns + 10 * MS
+        now_ns = status.received_ns + 10 * MS_NS
         status, _ = device.apply_command(status, command(uniform(height_nm), 3, time_ns=status.commanded_ns), now_ns)
         assert status.surface_nm.max() == pytest.approx(height_nm, abs=1), number
         assert np.abs(status.surface_nm - before).max() <= LIMITS.slew_nm
@@ -307,7 +307,7 @@ def test_apply_command_does_not_modify_its_arguments() -> None:
     channels = {name: shape_nm.copy() for name, shape_nm in status.channels.items()}
     sent = command(uniform(700), 2, channel="other")
     device.apply_command(status, sent, START_NS)
-    device.tick(status, START_NS + 10_000 * MS)
+    device.tick(status, START_NS + 10_000 * MS_NS)
     assert np.array_equal(status.driven_nm, driven)
     assert np.array_equal(status.surface_nm, surface)
     np.testing.assert_equal(dict(status.channels), channels)

@@ -64,8 +64,8 @@ def test_random_walk_grows_with_the_square_root_of_time() -> None:
     times_s, moved = np.array([0.3, 3.0, 30.0, 300.0]), []
     for seed in range(300):
         frequency_hz, amplitude = walk(np.random.default_rng(seed), np.array([0.2, 0.4]))
-        at = np.exp(2j * np.pi * np.outer([0.0, *times_s], frequency_hz)) @ amplitude
-        moved.append((at[1:] - at[0]).real)
+        positions = np.exp(2j * np.pi * np.outer([0.0, *times_s], frequency_hz)) @ amplitude
+        moved.append((positions[1:] - positions[0]).real)
     expected = np.outer(np.sqrt(times_s), [0.2, 0.4])
     np.testing.assert_allclose(np.std(moved, axis=0), expected, rtol=0.15)
 
@@ -91,7 +91,7 @@ def test_a_wheel_that_would_not_run_down_is_refused(wrong: dict[str, float]) -> 
 
 
 def test_two_wheels_beat() -> None:
-    """The amplitude of two equal harmonics' sum beats, at the difference of the speeds, between double and zero."""
+    """The amplitude of the sum of two equal harmonics beats at the speed difference, between zero and twice theirs."""
     one, other = wheels(1, (30.0, 30.5), np.array([2.0]))
     time_s = np.arange(0, 4, 1e-3)
     both = [replace(each, amplitude_nm=np.array([[2.0], *[[0]] * 4]) + 0j) for each in (one, other)]
