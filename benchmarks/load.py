@@ -81,7 +81,7 @@ def shares(moments: Sequence[Moment], seconds: float) -> dict[str, Result]:
 
     `share`: processor time of all threads, in processors. Empty with fewer than two samples in that time.
     """
-    complete = [moment for moment in moments if moment.roles.keys() >= LOOP][:-1]  # the last may be during shutdown
+    complete = [moment for moment in moments if moment.roles.keys() >= LOOP][:-1]  # the last may be from the shutdown
     inside = [moment for moment in complete if moment.at_s >= complete[-1].at_s - _FRACTION * seconds]
     if len(inside) < 2:
         return {}

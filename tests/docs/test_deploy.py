@@ -1,6 +1,6 @@
 """Files in deploy: valid systemd units, containers, and processes that report to their supervisor.
 
-The processes are started as by their units, with a socket of the test in place of systemd's.
+The test starts the processes as their units do, with its own socket in place of systemd's.
 """
 
 import contextlib
@@ -120,7 +120,7 @@ def test_the_units_are_hardened(units: Path, tmp_path: Path) -> None:
 
 
 @needs_systemd
-def test_user_and_folders_are_created(tmp_path: Path) -> None:
+def test_the_user_and_the_folders_of_the_services_are_created(tmp_path: Path) -> None:
     (tmp_path / "etc").mkdir()
     for tool in (["systemd-sysusers"], ["systemd-tmpfiles", "--create"]):
         kind = tool[0].removeprefix("systemd-")
@@ -229,7 +229,7 @@ def test_the_containers_run_the_commands_of_the_units() -> None:
         assert f"./lowfc.toml:{CONFIGURED}:ro" in service["volumes"]
     assert len(services) == len(UNITS) - 1  # all except the router
     assert program(services["controller"]["healthcheck"]["test"][1:]) == "ctl"
-    for name in ("controller", "recorder"):  # latch and logs; the root is read-only
+    for name in ("controller", "recorder"):  # for latch and logs, because the root is read-only
         assert any(volume.endswith(":/var/lib/lowfc") for volume in services[name]["volumes"])
     containerfile = (DEPLOY / "Containerfile").read_text()
     last_stage = containerfile.rpartition("\nFROM ")[2]
@@ -335,7 +335,7 @@ def test_processes_notify_systemd_that_they_are_ready_alive_and_stopping(tmp_pat
         (tmp_path / "hang").touch()
         until(lambda: "COMMAND_EXPIRED" in mirror.stderr_file.read_text())  # the controller sends nothing
         assert quiet()
-        controller.process.send_signal(signal.SIGABRT)  # as by systemd
+        controller.process.send_signal(signal.SIGABRT)  # as systemd does when the watchdog expires
         assert controller.process.wait(20) == -signal.SIGABRT
         assert "advance_or_hang" in controller.stderr_file.read_text()  # the journal shows where it hung
         remaining = [one for one in processes.values() if one is not controller]

@@ -37,7 +37,7 @@ def without_collector() -> Iterator[None]:
     gc.enable()
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::PendingDeprecationWarning")  # of the extensions
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::PendingDeprecationWarning")  # by Sphinx extensions
 @pytest.mark.usefixtures("without_collector")
 @pytest.mark.parametrize("complete", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_site_has_every_page_and_every_declared_name(

@@ -24,7 +24,7 @@ def flat_nm() -> Array:
 
 @pytest.fixture(scope="module")
 def dark_hole_run(tmp_path_factory: pytest.TempPathFactory) -> DarkHoleRun:
-    """Twenty steps with the shift of the zero point, then without; on a mirror with a flat map and dead actuators."""
+    """Steps of a dark hole with the zero point shifted, then without; the mirror has a flat map and dead actuators."""
     folder = tmp_path_factory.mktemp("dark_hole")
     active = np.ones(GRID)
     active.flat[list(DEAD)] = 0

@@ -150,7 +150,7 @@ def started(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 
 @pytest.fixture
 def bench(started: Bench) -> Bench:
-    """The bench, once its loop has settled after the test before."""
+    """The bench, once its loop has settled after the previous test."""
     started.wait_until_settled()
     return started
 
@@ -338,7 +338,7 @@ def test_a_forged_command_with_the_controllers_certificate_reaches_the_mirror(be
     bench.wait_until_settled()
 
 
-def test_a_forger_gets_nothing_and_moves_nothing(bench: Bench, tmp_path: Path) -> None:
+def test_a_forger_receives_no_message_and_no_answer_and_moves_no_mirror(bench: Bench, tmp_path: Path) -> None:
     """The certificates of the forgers: of another role, of an unknown role, of a foreign authority; two have none."""
     camera, desk = bench.lab["camera"], bench.lab["desk"]
     make_certificates(bench.authority, ["stranger"], [])

@@ -64,7 +64,7 @@ def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_pat
 
 
 @pytest.mark.parametrize("frames", [1_200, pytest.param(20_000, marks=pytest.mark.slow)])
-def test_the_residual_is_the_predicted_one(tmp_path: Path, frames: int) -> None:
+def test_the_tilt_residual_agrees_with_the_prediction(tmp_path: Path, frames: int) -> None:
     """The prediction |S|^2 P_d + |T|^2 P_n holds within 10 % for 5 mas rms of tilt per axis and half the limiting gain.
 
     Beyond 10 mas the sensor's optical gain drops (0.92 at 14 mas), so this holds for small tilts only.

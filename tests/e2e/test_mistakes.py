@@ -40,7 +40,7 @@ def layout(holes: list[list[float]]) -> str:
         (f"[recorder]\nfolder = '{'x' * 300}'", "x cannot be accessed: File name too long"),
     ],
 )
-def test_an_invalid_configuration_is_refusal(tmp_path: Path, config: str, expected: str) -> None:
+def test_an_invalid_configuration_is_refused(tmp_path: Path, config: str, expected: str) -> None:
     _refusal(tmp_path, *SHORT, config=config, expected=expected)
 
 
@@ -57,7 +57,7 @@ def test_check_refuses_what_a_run_would_refuse(tmp_path: Path, config: str, expe
     _refusal(tmp_path, "config", "check", "lowfc.toml", expected=expected)
 
 
-def test_an_invalid_layout_is_refusal(tmp_path: Path) -> None:
+def test_an_invalid_layout_is_refused(tmp_path: Path) -> None:
     (tmp_path / "mask.json").write_text(layout([[0.0, 0.2], [0.05, 0.2]]))
     _refusal(tmp_path, *SHORT, "--sensor", "mask.json:mine", expected="overlap")
 
@@ -71,7 +71,7 @@ def test_an_even_symmetric_layout_is_warned_about(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_an_invalid_calibration_is_refusal(tmp_path: Path) -> None:
+def test_an_invalid_calibration_is_refused(tmp_path: Path) -> None:
     arguments = ["controller", "--run", "mistakes", "--calibration"]
     _refusal(tmp_path, *arguments, "none.fits", expected="there is no such calibration file")
     (tmp_path / "text.fits").write_bytes(b"hello")

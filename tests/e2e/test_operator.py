@@ -106,7 +106,7 @@ def _run_program(night: Night, program: str) -> str:
     source = program.replace('"bench"', repr(night.name)).replace("Client()", f"Client({night.name!r})")
     source = source.replace('"lowfc", "config"', f"{sys.executable!r}, '-m', 'lowfc', 'config'")
     with contextlib.redirect_stdout(printed):
-        exec(compile(source, DOCUMENT.name, "exec"), {"__name__": "example"})  # noqa: S102  # our own document's
+        exec(compile(source, DOCUMENT.name, "exec"), {"__name__": "example"})  # noqa: S102  # from our own document
     return printed.getvalue()
 
 

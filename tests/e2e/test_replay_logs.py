@@ -116,7 +116,7 @@ def test_logs_with_requests_a_restart_dropped_frames_and_rotation_are_replayed_i
     assert len({message.sequence >> 32 for message in states}) == 2
 
 
-def test_a_minute_at_a_kilohertz_is_lossless_and_identical(tmp_path: Path) -> None:
+def test_a_minute_at_a_kilohertz_is_recorded_without_loss_and_replayed_identically(tmp_path: Path) -> None:
     options = ("--rate", "1000", "--duration", "60", "--disturbance", "reaction-wheel")
     results = loop(tmp_path, *options, timeout_s=200)
     assert results["messages_lost"] == 0

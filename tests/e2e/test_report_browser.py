@@ -98,7 +98,7 @@ def test_the_text_contains_the_values_of_the_json(measurements: dict[str, Any], 
     expected += [f"{stage['p99']:.1f}" for stage in results["timing"]["latency_us"].values()]
     expected += [term[key] for term in budget["terms"] for key in ("name", "how")]
     expected.append(f"{budget['true_residual']['rms_nm']['all modes']:.3f}")
-    expected.append("rate_hz = 250.0")  # the configuration, folded
+    expected.append("rate_hz = 250.0")  # from the configuration, which the page folds
     assert [one for one in expected if one not in text] == []
 
 

@@ -102,7 +102,7 @@ def test_a_viewer_that_hangs_or_dies_is_noticed(web: RerunViewer) -> None:
     assert f"the viewer on port {web.port} was killed by SIGKILL" in web.exit_description()
 
 
-def test_a_new_viewer_on_the_same_port_takes_a_new_stream(web: RerunViewer) -> None:
+def test_a_new_viewer_on_the_same_port_receives_a_new_stream(web: RerunViewer) -> None:
     old_stream = _send_two_colours(web)
     os.kill(web.pid, signal.SIGSTOP)
     web.stop()

@@ -98,7 +98,7 @@ ORDERS = list(itertools.permutations(["camera", "controller", "mirror-dm"]))
 
 @pytest.fixture(scope="module", params=[ORDERS[0], *(pytest.param(one, marks=pytest.mark.slow) for one in ORDERS[1:])])
 def bench(folder: Path, request: pytest.FixtureRequest) -> Iterator[ManualRun]:
-    """Each process is up before the next starts; the parameters are all start orders."""
+    """A bench started by hand in each possible order; each process is up before the next starts."""
     bench = ManualRun(folder)
     for name in request.param:
         bench.start(name)

@@ -105,7 +105,7 @@ def test_a_log_of_0_1_is_drawn(tmp_path: Path) -> None:
         (["acceptance", "linearity", NIGHT], "no `lowfc acceptance"),
     ],
 )
-def test_a_command_for_which_the_log_is_unsuitable_refuses_it(arguments: list[object], message: str) -> None:
+def test_a_command_refuses_a_log_that_is_unsuitable_for_it(arguments: list[object], message: str) -> None:
     assert message in refusal(*arguments)
 
 

@@ -39,7 +39,7 @@ def test_late_commands_after_a_restart_of_the_camera_are_counted(tmp_path: Path)
     night = SyntheticLog()
     for start_s, count, late in ((START, 0, 40), (START, 1, 43), (START + 60, 0, 4), (START + 60, 1, 6)):
         night.put(HEALTH, wire.Health(process="camera", commands_late=late), sequence_of(start_s, count), "camera")
-    assert history_of(night, tmp_path / "x.mcap").commands_late == 3 + 6  # 40 precede the log
+    assert history_of(night, tmp_path / "x.mcap").commands_late == 3 + 6  # the first 40 were late before the log
 
 
 def test_the_rate_is_that_of_most_steps_and_steps_at_another_rate_are_marked(tmp_path: Path) -> None:

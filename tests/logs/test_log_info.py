@@ -115,7 +115,7 @@ def test_the_text_says_whether_the_run_was_in_lockstep_if_that_is_known(log: Pat
     assert survey.survey(longer, digest=True)["digest"] != contents["digest"]
 
 
-def test_the_text_has_the_same_numbers(log: Path) -> None:
+def test_the_text_of_info_has_the_numbers_of_its_json(log: Path) -> None:
     text = lowfc("info", log).stdout
     for expected in (
         "complete",

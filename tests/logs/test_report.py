@@ -115,13 +115,13 @@ def test_frames_are_accounted_for(eventful: dict[str, Any]) -> None:
     assert eventful["timing"]["rate_hz"] == RATE_HZ
 
 
-def test_commands_of_a_camera_that_does_not_count_late_ones_are_not_called_in_time(tmp_path: Path) -> None:
+def test_without_a_count_of_late_commands_the_commands_are_not_called_in_time(tmp_path: Path) -> None:
     results = results_of(uneventful(SyntheticLog(truth=False)).write(tmp_path / "log.mcap"))
     assert results["timing"]["frames"]["commands_late"] is None
     assert check_of(results, "delay")["level"] == "unknown"
 
 
-def test_latencies_are_those_of_the_messages(eventful: dict[str, Any]) -> None:
+def test_latencies_agree_with_the_times_in_the_messages(eventful: dict[str, Any]) -> None:
     latency = eventful["timing"]["latency_us"]
     assert latency["transport"] == {"count": 2244, **dict.fromkeys(("p50", "p90", "p99", "p99_9", "max"), 90.0)}
     assert latency["frame_to_command"]["max"] == 349

@@ -97,7 +97,7 @@ BENCH = {"disturbance__preset": "bench", "disturbance__scale": 0.7}
         ),
     ],
 )
-def test_in_the_linear_range_a_what_if_agrees_with_a_run_with_those_gains(
+def test_in_the_linear_range_a_what_if_agrees_with_a_run_with_the_same_gains(
     frames: int, pair: tuple[Gains, Gains], delay: float, tolerance_nm: float, overrides: dict[str, Any]
 ) -> None:
     """A what-if with the run's own law reproduces its errors; with another run's law, it predicts their rms to 10 %."""
@@ -122,7 +122,7 @@ OTHER = "gain=0.3,tilt_gain=0.2,leak=0.01"
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LoggedRun]:
-    """A closed loop, and one with other gains whose controller has a wrong delay."""
+    """Logs of a closed loop, and of a loop with other gains whose controller assumes a wrong delay."""
     folder, runs = tmp_path_factory.mktemp("logs"), {}
     other = {"gain": (0.2, 0.3), "leak": (0.01, 0.01), "delay_frames": 2.0}
     toml = load(None, {"sensor.modes": 10}).to_toml()  # with 10 modes the contrast, which is slow, is not computed
@@ -153,7 +153,7 @@ def test_the_logged_gains_reproduce_the_logged_run(runs: dict[str, LoggedRun]) -
     assert results["warnings"] == []
 
 
-def test_added_contrast_of_shaped_pupil_and_lyot_coronagraph() -> None:
+def test_added_contrast_is_computed_for_shaped_pupil_and_lyot_coronagraph() -> None:
     """A tenth of a nm of spherical in one run, none in the other."""
     spherical = np.diag(0.01 * np.eye(14)[9])
 
@@ -185,7 +185,7 @@ class BetweenFramesLog(SyntheticLog):
         self._moved_nm = (before_nm + self._moved_nm) / 2
 
 
-def test_the_continuous_residual_of_a_fractional_delay_is_that_of_the_moving_mirror(tmp_path: Path) -> None:
+def test_with_a_fractional_delay_the_continuous_residual_includes_the_motion_of_the_mirror(tmp_path: Path) -> None:
     """Expected: true disturbance and commands; the mirror moves a quarter of a period after an exposure's start."""
     toml = load(None, {"sensor.modes": 10, "camera.delay_frames": 1.5}).to_toml()
     log = BetweenFramesLog(delay_frames=1.5, gain=(0.6, 0.6)).frames(FRAMES)

@@ -71,7 +71,9 @@ def test_a_step_retains_no_memory_and_allocates_only_frame_and_actuators(monkeyp
     assert step.allocated(ControlStep(config, calibration, 0), Payloads(frames))["kept_bytes"] > 100
 
 
-def test_the_stages_are_those_of_a_step_and_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_stage_of_a_step_has_a_duration_and_the_remainder_is_not_negative(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     nothing = step.set_up(None, None, lock_memory=False, disable_cpu_idle=False)
     monkeypatch.setattr(step, "set_up", lambda *_, **__: nothing)  # do not change this process
     original = stepping.limit
@@ -264,7 +266,7 @@ def moment(at_s: float, **used_s: float) -> load.Moment:
     return load.Moment(at_s, {role: load.Used(one, "0", 2_000_000) for role, one in used_s.items()})
 
 
-def test_shares_are_over_the_time_in_which_all_processes_ran() -> None:
+def test_shares_are_averaged_over_the_time_in_which_all_processes_ran() -> None:
     moments = [moment(0.0, camera=5.0)]
     moments += [moment(1 + tenth / 10, camera=9 + tenth / 20, controller=1, mirror=tenth / 40) for tenth in range(12)]
     moments += [moment(3.0, camera=99.0)]

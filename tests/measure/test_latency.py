@@ -214,7 +214,7 @@ def test_the_last_of_many_processors_is_read(tmp_path: Path, monkeypatch: pytest
     assert stolen_ns == 511 * 1_000_000_000 // os.sysconf("SC_CLK_TCK")
 
 
-def test_signs_of_a_stall_are_sorted_by_cause_host_or_loop() -> None:
+def test_signs_of_a_stall_are_divided_into_signs_of_the_host_and_of_the_loop() -> None:
     nothing: Any = dict.fromkeys(CountChanges.model_fields, 0)
     cases: list[tuple[dict[str, float], tuple[list[str], list[str]]]] = [
         ({"bare_late_us": 250}, (["bare loop 250 us late"], [])),

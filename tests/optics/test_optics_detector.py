@@ -59,7 +59,7 @@ def test_a_million_pixels_pass_the_chi_square_test(camera, mean_e):
     assert found[-1] < 10 * min_expected
 
 
-def test_an_exact_camera_has_no_table_and_the_same_mean_and_variance():
+def test_an_exact_camera_has_no_noise_table_and_the_mean_and_variance_of_a_camera_with_one():
     camera = Detector(exact=True)
     assert noise_table_of(camera) is None
     exact, drawn = (expose(one, flat(2.3), rng()).astype(float) for one in (camera, Detector()))

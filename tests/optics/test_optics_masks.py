@@ -43,7 +43,7 @@ def test_packaged_layouts_are_valid():
         assert open_area == pytest.approx(np.pi / 4 * sum(hole[2] ** 2 for hole in layout.holes), rel=0.01)
 
 
-def test_hole_positions_follow_x_and_y():
+def test_x_of_a_hole_runs_along_columns_and_y_along_rows():
     mask = transmission(Layout("one", "", ((0.3, -0.2, 0.1),)), 100)
     rows, columns = np.nonzero(mask)
     assert (rows.mean() + 0.5) / 100 - 0.5 == pytest.approx(-0.2)

@@ -109,7 +109,7 @@ def test_estimates_agree_with_true_coefficients(tables):
     assert all(row.limit < 1.0 for row in rows)
     assert len(values(rows, "R^2", "pinv")) == 14
     assert values(rows, "mean R^2", "pinv")[0] > 0.97
-    assert values(rows, "least R^2", "pinv")[0] > 0.8  # four wavefronts; a hundred in the last test
+    assert values(rows, "least R^2", "pinv")[0] > 0.8  # with four wavefronts; the last test has a hundred
 
 
 def test_two_iterations_approach_the_limit(tables):

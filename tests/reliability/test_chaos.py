@@ -372,7 +372,7 @@ def test_an_interrupt_while_a_case_is_prepared_leaves_no_run(tmp_path: Path, mon
     assert [path for path in runtime_base().iterdir() if path.is_dir()] == []
 
 
-def test_without_a_case_all_are_listed_and_the_error_of_an_unknown_one_suggests_a_name() -> None:
+def test_without_a_case_all_cases_are_listed_and_an_unknown_case_gets_a_suggestion() -> None:
     table = run()
     assert all(name in table for name in CASES)
     assert [one["name"] for one in json_of("chaos")["cases"]] == list(CASES)

@@ -55,7 +55,7 @@ def test_statistics_cover_the_second_half_of_a_run_of_any_length(frames: int) ->
     assert len(run._blocks) == MAX_BLOCKS
 
 
-def test_statistics_are_rms_over_frames_and_tilts_per_axis() -> None:
+def test_statistics_are_rms_over_frames_and_tilts_are_per_axis() -> None:
     assert statistics().wavefront() == {}
     found = statistics(*[3.0, 5.0] * 250, nm_per_mas=2.0).wavefront()
     rms_nm = np.sqrt((3**2 + 5**2) / 2)

@@ -18,7 +18,7 @@ DETECTOR = Detector(full_well_e=40_000.0, bias_dn=100.0)
 quiet = partial(configuration, {"disturbance.preset": "quiet", "star.magnitude": 20.0})
 
 
-def test_dark_current_is_poisson_of_the_exposure_time() -> None:
+def test_dark_current_has_a_poisson_distribution() -> None:
     """400 electrons per second in 2 ms: digital numbers have a Poisson distribution with mean 0.8."""
     config = quiet(camera__dark_current_e_s=400.0, camera__read_noise_e=0.0)
     assert config.dark_e == pytest.approx(0.8)

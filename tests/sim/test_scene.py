@@ -151,7 +151,7 @@ def test_exposure_nodes_average_a_vibration_and_are_two_if_it_is_slow() -> None:
 
 
 @pytest.mark.slow
-def test_blurred_image_is_as_accurate_as_one_at_rest() -> None:
+def test_a_blurred_image_is_as_accurate_as_an_image_at_rest() -> None:
     """The twin's two nodes against 64 images of the full optics: the error is at most 1.1 times the error at rest."""
     keys = {"disturbance__preset": "reaction-wheel-ideal", "camera__rate_hz": 1000.0}
     config = configured(**FINE, **keys)

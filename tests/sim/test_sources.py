@@ -52,7 +52,7 @@ def test_phase_of_wheel_harmonics_is_the_integral_of_the_speed(course: str, chan
     assert np.abs(spinning.amplitude_nm[:, 0] / spinning.amplitude_nm[0, 0]) == pytest.approx(HEIGHTS)
 
 
-def test_phase_of_a_random_walk_speed_is_its_integral() -> None:
+def test_phase_of_a_wheel_whose_speed_wanders_is_the_integral_of_the_speed() -> None:
     spinning, time_s = wheel("walk", 0.5), TIME_S[::10]
     speed = spinning.speed_hz(time_s)
     assert speed[0] == pytest.approx(30)
@@ -112,7 +112,7 @@ def test_sensor_sees_the_mean_of_fast_jitter_over_the_exposure(exposure: float) 
     np.testing.assert_allclose(
         np.sqrt(variances_nm2(disturbance)[1].sum(axis=0))[:3] / NM_PER_MAS, [2, 2, 0], rtol=1e-3
     )
-    simulated, samples = scene(config), 2000  # per frame period
+    simulated, samples = scene(config), 2000  # samples per frame period
     for index in (0, 7, 8, 30):
         within = modes_nm(disturbance, index * samples, round(exposure * samples) + 1, 1000.0 * samples)
         mean = (within[1:] + within[:-1]).mean(axis=0) / 2

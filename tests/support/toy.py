@@ -16,7 +16,7 @@ from lowfc.control.loop.state import Settings, State
 
 SHAPE, GRID, NOLL = (6, 7), (4, 5), (2, 3, 4)
 FLUX_DN, DARK_DN, SATURATION_DN = 200_000.0, 100.0, 60_000.0
-START = 1_700_000_000  # of every process, s since 1970
+START = 1_700_000_000  # start of every process, s since 1970
 PERIOD_NS = 1_000_000
 WAVE_NM = (10.0, -5.0, 3.0)  # modes of a wavefront, nm
 # Clock-induced charge and dark current lift the dark above the bias.

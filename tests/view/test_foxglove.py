@@ -133,7 +133,7 @@ def bridge(bus: MemoryBus) -> Iterator[FoxgloveBridge]:
         yield bridge
 
 
-def test_channels_are_those_of_the_topic_table_and_have_their_schemas(bridge: FoxgloveBridge, bus: MemoryBus) -> None:
+def test_every_topic_of_the_viewer_has_a_channel_with_its_schema(bridge: FoxgloveBridge, bus: MemoryBus) -> None:
     shown = {"/" + topic.at("dm"): topic for topic in SHOWN if topic not in (BENCH, HEALTH, SURFACE)}
     with connected(bridge.port) as client:
         bus.publisher(COMMAND, "dm").put(b"")  # not a topic of the viewer: no channel may appear

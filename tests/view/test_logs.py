@@ -88,7 +88,7 @@ def test_the_final_verdict_is_on_the_log_and_not_on_a_recording(
     ("in_health", "at_the_end", "detail"),
     [((0, 0), 3, "night, 3 messages lost"), ((2, 2), 0, "night, nothing lost"), ((2, 7), 0, "night, 5 messages lost")],
 )
-def test_the_verdict_has_the_losses_during_the_log_and_not_the_recorders_earlier_ones(
+def test_the_verdict_has_the_losses_during_the_log_and_not_the_recorders_earlier_losses(
     tmp_path: Path, shown: Shown, in_health: tuple[int, int], at_the_end: int, detail: str
 ) -> None:
     night = SyntheticLog()
@@ -159,7 +159,7 @@ def test_the_verdict_on_a_log_says_that_its_residual_includes_a_shape(tmp_path: 
     assert "with offset and channels" in shown[-1].headline
 
 
-def test_frames_two_seconds_apart_leave_no_gap_and_a_frame_with_a_wrong_time_adds_none(
+def test_frames_two_seconds_apart_leave_no_gap_and_a_frame_with_a_wrong_time_adds_no_gap(
     tmp_path: Path, shown: Shown, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(report_log, "PERIOD_NS", 2_000_000_000)

@@ -206,7 +206,7 @@ def test_no_two_states_have_the_same_headline(verdicts: dict[str, Verdict]) -> N
         (Limit.NOT_FINITE, "check calibration and law"),
     ],
 )
-def test_the_advice_at_a_limit_is_that_for_this_limit(limit: Limit, remedy: str) -> None:
+def test_each_limit_has_its_own_advice(limit: Limit, remedy: str) -> None:
     headline = verdict_after(setting(reasons=(limit,)), 2).headline
     assert remedy in headline
     assert limit is Limit.MODAL_LIMIT or "raise" not in headline  # the others protect the mirror
@@ -361,7 +361,7 @@ def test_a_view_that_is_behind_does_not_report_the_run_as_dead() -> None:
         (1.5, None, Level.NEUTRAL),
         (2.5, None, Level.GOOD),
         (2.5, ResidualComparison(2.0, 1.9, 0.5), Level.GOOD),
-        (2.5, ResidualComparison(4.0, 1.9, 0.5), Level.NEUTRAL),  # the best gains would leave half
+        (2.5, ResidualComparison(4.0, 1.9, 0.5), Level.NEUTRAL),  # the best gains would leave half the residual
         (1.5, ResidualComparison(2.0, 1.9, 0.5), Level.NEUTRAL),
         (5.0, ResidualComparison(2.0, 1.0, 8.0), Level.GOOD),  # within the uncertainty of the noise
     ],
@@ -425,7 +425,7 @@ def test_a_loop_that_opened_for_another_reason_is_not_blamed_on_the_camera(reaso
     assert (tile(verdict, "LOOP").level, verdict.level) == (Level.NEUTRAL, Level.NEUTRAL)
 
 
-def test_the_cause_of_the_mode_is_that_of_the_controllers_state() -> None:
+def test_the_controllers_state_gives_the_cause_of_the_mode() -> None:
     stage = begun(1)
     to_mode(LoopMode.OPEN, "operator asked to pause")(stage)
     stage.send(CONTROLLER_STATE, wire.ControllerState(mode=wire.LOOP_MODE_OPEN, mode_cause="operator asked to open"))
