@@ -100,7 +100,7 @@ def test_the_camera_is_compared_with_the_calibrations_settings() -> None:
         (replace(CAMERA, bias_dn=float("nan")), ["bias_dn"]),
     ],
 )
-def test_only_differences_beyond_the_tolerances_are_changes(now: CameraSettings, different: list[str]) -> None:
+def test_only_differences_beyond_the_tolerances_count_as_changes(now: CameraSettings, different: list[str]) -> None:
     assert [line.split()[0] for line in changes(now, CAMERA)] == different
 
 
@@ -287,8 +287,8 @@ def test_a_matching_camera_ends_the_idle_mode() -> None:
     assert names(all_outputs) == ["MODE_CHANGED"]
 
 
-def test_a_measured_calibration_of_another_frame_size_opens_the_loop() -> None:
-    """So does every other camera that does not fit the calibration."""
+def test_a_camera_that_does_not_fit_a_measured_calibration_opens_the_loop() -> None:
+    """Here the frames have another size: with a computed calibration the loop would be idle."""
     state, _ = feed(DEFAULTS, State(), Load(0, calibration(), "a file"), replace(CAMERA, shape=MISFIT_IMAGE.shape))
     assert state.mode is LoopMode.OPEN
 

@@ -73,7 +73,7 @@ def dark_hole(scale_nm: float = 20.0, seed: int = 5) -> Single:
     return (scale_nm * np.random.default_rng(seed).standard_normal(GRID)).astype(np.float32)
 
 
-def test_a_channel_is_applied_within_the_slew_limit_and_not_undone() -> None:
+def test_a_channel_is_applied_within_the_slew_limit_and_the_loop_does_not_undo_it() -> None:
     loop, shape = ToyLoop(), dark_hole(60.0)
     loop.run(40)
     before = loop.surfaces[-1]
@@ -156,7 +156,7 @@ def test_a_probe_sequence_plays_one_row_per_frame_and_ends(mode: LoopMode) -> No
     assert np.allclose(loop.outputs[-3].step.command_nm, 0)  # the modal command excludes the played shapes
 
 
-def test_a_probe_sequence_larger_than_the_slew_limit_leaves_nothing_on_the_mirror() -> None:
+def test_a_probe_sequence_whose_end_exceeds_the_slew_limit_leaves_nothing_on_the_mirror() -> None:
     loop = ToyLoop(mode=LoopMode.OPEN)
     loop.run(2)
     held = loop.surfaces[-1]
@@ -394,7 +394,7 @@ def test_a_calibration_loaded_in_safe_mode_leaves_nothing_on_the_mirror() -> Non
 
 
 @pytest.mark.parametrize("signal", [None, "error", "pol"])
-def test_an_offset_moves_the_loop_but_not_the_pseudo_open_loop_modes(signal: Signal | None) -> None:
+def test_an_offset_moves_the_wavefront_but_not_the_pseudo_open_loop_modes(signal: Signal | None) -> None:
     """This holds for the integrator, for a law of the error, and for a law of pseudo-open-loop modes."""
     loop, target = ToyLoop(), (4.0, 0.0, -2.0)
     if signal is not None:

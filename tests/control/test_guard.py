@@ -87,7 +87,7 @@ def test_the_integrator_takes_over_the_group_with_a_worse_law(law: LinearLaw, ex
     assert Limit.LAW_OVERRULED not in state.limits_hit
 
 
-def test_without_a_law_or_with_guard_off_nothing_is_guarded() -> None:
+def test_there_is_no_guard_without_a_law_or_if_guard_is_off() -> None:
     setup = replace(SETUP, guard=False)
     reasons, state = run(with_law(BAD_TILT, setup), 1000, setup=setup)
     assert (reasons, state.loop.law_runner.guard) == ([], None)

@@ -254,7 +254,7 @@ def test_a_gain_has_a_remark_if_it_is_above_the_highest_gain_within_the_margins(
     assert ["lowfc tune" in text for text in texts] == [False, True]
 
 
-def test_the_reply_to_a_removal_names_the_channel_or_those_that_exist() -> None:
+def test_the_reply_to_the_removal_of_a_channel_names_it_or_the_existing_channels() -> None:
     state = loaded(DEFAULTS)
     after, reply = answer(state, "channel", text="dark-hole")
     assert (reply.accepted, reply.text) == (False, "there is no channel 'dark-hole' to remove; there are none")

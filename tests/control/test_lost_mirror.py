@@ -69,7 +69,7 @@ def test_without_a_mirror_an_open_loop_measures_and_is_not_closed() -> None:
     check_reply(feed(DEFAULTS, state, BACK, *frames(7), Request(0, "close"))[1][-1], True)
 
 
-def test_a_lost_mirror_ends_the_probe_sequence_and_refuses_others() -> None:
+def test_a_lost_mirror_ends_the_probe_sequence_and_another_one_is_refused() -> None:
     probe = Request(0, "play", text="offset", table=np.zeros((50, 3), np.float32))
     _, all_outputs = feed(DEFAULTS, running(), probe, *frames(6), LOST, probe)
     check_reply(all_outputs[0], True)

@@ -306,7 +306,7 @@ NAMES = [
 
 
 @pytest.mark.parametrize("seeds", [24, pytest.param(1000, marks=pytest.mark.slow)])
-def test_random_inputs_are_handled_purely_and_within_the_limits(seeds: int) -> None:
+def test_random_inputs_are_handled_without_side_effects_and_within_the_limits(seeds: int) -> None:
     """Each request but `configuration`, which the process answers, is accepted at least once; most are also refused."""
     rng = np.random.default_rng(6)
     counts: Counter[tuple[str, bool]] = Counter()

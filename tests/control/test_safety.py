@@ -101,14 +101,14 @@ def test_diagonal_actuators_are_not_neighbours() -> None:
 
 
 @pytest.mark.parametrize("shape", [(5, 4), (4, 4), (20,), (0, 0), (1, 4, 5)])
-def test_another_grid_is_refused(shape: tuple[int, ...]) -> None:
+def test_a_requested_shape_of_another_grid_is_refused(shape: tuple[int, ...]) -> None:
     previous = np.full(GRID, 7, np.float32)
     limited = limit(LIMITS, previous, np.zeros(shape, np.float32))
     assert limited.reasons == (Limit.WRONG_GRID,)
     assert np.array_equal(limited.actuators_nm, previous)
 
 
-def test_a_request_beyond_the_range_of_float32_is_limited_too() -> None:
+def test_a_requested_shape_beyond_the_range_of_float32_is_limited_too() -> None:
     limited = limit(LIMITS, np.zeros(GRID, np.float32), np.full(GRID, 1e300))
     assert violations(LIMITS, np.zeros(GRID, np.float32), limited.actuators_nm) == []
     assert limited.actuators_nm.dtype == np.float32
@@ -187,7 +187,7 @@ def test_safe_clear_open_and_close_lead_to_the_specified_modes() -> None:
     check_modes(safety)
 
 
-def test_an_unknown_request_is_an_error_of_the_program() -> None:
+def test_request_mode_refuses_an_unknown_request() -> None:
     with pytest.raises(ValueError, match="'dance'"):
         request_mode(LoopMode.OPEN, "dance", calibrated=True)
 

@@ -1,4 +1,4 @@
-"""Highest gains of the integrator: at which its loop starts to oscillate, and at which it has the least margins.
+"""Highest gains of the integrator: up to oscillation of its loop, and up to the least allowed margins.
 
 The loop of `lowfc.control.laws.integrator`: command[k] = (1 - leak) command[k-1] - gain error[k], and
 error[k] = disturbance[k] + sum_j w_j command[k-1-j] + noise[k], with w from the delay in frames.

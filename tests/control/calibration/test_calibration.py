@@ -130,7 +130,7 @@ def test_a_fitted_nuisance_parameter_is_not_measured_as_modes_whatever_its_unit(
 
 
 @pytest.mark.parametrize("nuisance", [RESPONSE[:, :1], np.zeros((PIXELS, 1))])
-def test_a_nuisance_response_that_is_zero_or_equals_a_modes_is_refused(nuisance: np.ndarray) -> None:
+def test_a_nuisance_response_that_is_zero_or_equals_that_of_a_mode_is_refused(nuisance: np.ndarray) -> None:
     nuisance_response = normalise_flux(TOY.reference, nuisance, GOOD)[1]
     with pytest.raises(ValueError, match="nuisance parameters apart"):
         reconstructor(I0, H, GOOD, 1e5, 1.0, nuisance=nuisance_response)

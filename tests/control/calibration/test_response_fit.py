@@ -342,7 +342,7 @@ def test_poorly_measured_combinations_can_be_truncated_or_damped() -> None:
     assert np.allclose(from_measured.matrix, truncated.matrix, rtol=1e-6, atol=1e-6)
 
 
-def test_too_few_usable_frames_are_an_error() -> None:
+def test_a_cycle_with_too_few_usable_frames_is_refused() -> None:
     plan = cycle(poke_patterns(MODES, 8.0), hold=1, settle=0, rest=0)
     fractions, flux = fractions_of(exposed(plan.table, 1))
     with pytest.raises(ValueError, match="do not tell the 4 modes apart"):

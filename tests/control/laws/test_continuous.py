@@ -94,7 +94,7 @@ def test_the_noise_of_an_integrators_command_has_a_closed_form() -> None:
 
 
 @pytest.mark.parametrize("timing", [Timing(1, 1, 0), Timing(1, 1, 0.5), Timing(2, 2, 0.9), Timing(1.3, 1.3, 0.5)])
-def test_means_are_interpolated_from_measurements(timing: Timing) -> None:
+def test_means_while_commands_are_in_force_are_interpolated_from_measurements(timing: Timing) -> None:
     """The means are those of waves with frequencies up to a quarter of the frame rate."""
     k = np.arange(400)
     for omega in (0.0, 0.04, 0.5, 1.5):
@@ -139,7 +139,7 @@ def test_the_held_residual_is_recovered_from_noisy_measurements() -> None:
     assert squares[0] / counted == pytest.approx(theory, rel=0.03)
 
 
-def test_predicted_means_of_the_states_agree_with_a_fine_sum() -> None:
+def test_mean_over_of_a_model_agrees_with_a_fine_sum() -> None:
     model = Model(1e-3, 40.0, (Line(37.0, 2.0, 9.0), Line(120.0, 1.0, 1.0)), 1.0, RATE_HZ)
     A = model.states()[0]
     values, vectors = np.linalg.eig(A)

@@ -108,7 +108,7 @@ def test_repeated_and_older_frames_are_not_new_exposures() -> None:
     assert missing_before(sequence[rows]).tolist() == [0, 0, 2, 0]
 
 
-def test_no_frames_are_missing_where_a_clear_lowers_the_sequence() -> None:
+def test_a_sequence_lowered_by_a_clear_does_not_count_as_missing_frames() -> None:
     sequence = np.array([*map(frame_sequence, [5, 9, 2, 3]), frame_sequence(7, 1_600_000_000)], np.uint64)
     assert missing_before(sequence).tolist() == [0, 3, 0, 0, 0]
 
@@ -140,7 +140,7 @@ def test_the_delay_is_recovered_from_message_times() -> None:
     assert delay_from_times(sequence, start_ns, reported[:5], times[:5]) is None
 
 
-def test_times_next_to_a_missing_frame_are_ignored() -> None:
+def test_commands_applied_next_to_a_missing_frame_do_not_count_for_the_delay() -> None:
     counts = [count for count in range(90) if count % 3 != 2]
     sequence = np.array([frame_sequence(count) for count in counts], np.uint64)
     start_ns = 1000 * np.array(counts)
@@ -155,7 +155,7 @@ def test_settling_takes_five_time_constants_and_at_least_250_frames(gain: object
     assert settling_frames(law.gain, law.leak, 250.0) == frames
 
 
-def test_frames_are_counted_from_the_start_of_the_loop() -> None:
+def test_frames_since_counts_from_the_start_of_the_loop_or_a_later_beginning() -> None:
     running = np.array([0, 1, 1, 1, 0, 1, 1, 1], bool)
     begins = np.array([0, 0, 0, 0, 0, 0, 1, 0], bool)
     missing = np.array([0, 0, 3, 0, 0, 0, 0, 0])
