@@ -215,7 +215,7 @@ def test_probe_sequences_resets_and_limits_suspend_the_comparison() -> None:
 
 
 def test_a_decoded_guard_continues_identically() -> None:
-    """It does so in every phase: while it compares, in the cross-fade, and while an overruled law is virtual."""
+    """It is decoded in each phase: while it compares, in the cross-fade, and while an overruled law is virtual."""
     state, frames_done = with_law(BAD_TILT), 0
     for until in (
         BEFORE + 150,

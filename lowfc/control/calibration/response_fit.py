@@ -198,7 +198,7 @@ def without_outliers(products: Array) -> Array:
     A transient of the wavefront then affects one cycle, not the mean.
     """
     median = np.median(products, axis=0)
-    # 1.48: ratio of standard to median absolute deviation; one scale per row, since its elements have the same noise
+    # 1.48: standard deviation / median absolute deviation; one scale per row, as the elements of a row have equal noise
     scale = 1.48 * np.median(np.abs(products - median), axis=(0, 2))[:, None]
     return np.clip(products, median - _OUTLIER_SIGMAS * scale, median + _OUTLIER_SIGMAS * scale)
 

@@ -237,7 +237,7 @@ class GainBank:
         return blocks
 
     def _with_cross_talk_margin(self, cross_talk_nm: Array) -> Array:
-        """As `_without_cross_talk`; cross-talk (modes,) counts `MARGIN` times if it is against a gain, else 0 times."""
+        """The same mean squares, with cross-talk (modes,) times `MARGIN` if it is against a gain, else without it."""
         against = np.mean(self._means, axis=0) * cross_talk_nm > 0
         return self._without_cross_talk(np.where(against, MARGIN * cross_talk_nm, 0))
 

@@ -84,7 +84,7 @@ def lag(law: LinearLaw, disturbance: Spectrum, mean_nm: Array, timing: Timing) -
 
 
 def lag_under_noise(law: LinearLaw, measured: Spectrum, mean_nm: Array, timing: Timing) -> Term:
-    """As `lag`, from spectrum and mean (modes,) of measurements: means over exposures, plus white noise.
+    """The residual of `lag`, from spectrum and mean (modes,) of measurements: means over exposures, plus white noise.
 
     The noise, the floor of the spectrum, is subtracted.
     """

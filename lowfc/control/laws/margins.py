@@ -278,7 +278,7 @@ def _gain_margins(loop: Complex) -> tuple[float, float]:
     crosses = np.signbit(before.imag) != np.signbit(after.imag)
     a, b = before[crosses], after[crosses]
     real = a.real - a.imag * (b.real - a.real) / (b.imag - a.imag)
-    real = np.append(real, loop[-1].real)  # at pi it is real
+    real = np.append(real, loop[-1].real)  # L is real at pi
     sizes = -real[real < 0]
     below, above = sizes[sizes < 1], sizes[sizes >= 1]
     return float(1 / below.max()) if below.size else np.inf, float(1 / above.min(initial=np.inf))

@@ -25,7 +25,7 @@ UNRELATED = frozenset({"status", "note", "lease", "renew", "release", "permit"})
 LEASE_OVER = "the lease ended: "
 """Beginning of the refusal of a renewal, before the cause."""
 REMAINING_TIME_SEPARATOR = ", about "
-"""In a lease's `holder`, separates the holder from its expected remaining time."""
+"""Separator of the holder and its expected remaining time in the `holder` of a lease."""
 
 
 class Lease(NamedTuple):

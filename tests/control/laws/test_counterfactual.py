@@ -47,7 +47,7 @@ def live_run(setup: Settings) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
 
 @pytest.mark.parametrize("delay", DELAYS)
 def test_the_logged_gains_reproduce_the_logged_errors_and_commands(delay: float) -> None:
-    """They do so up to float32 rounding in pol = error - seen, with missing and refused frames and modal limits."""
+    """Both agree up to float32 rounding in pol = error - seen; frames are missing or refused, a modal limit acts."""
     setup = settings(delay_frames=delay, gain=(0.3, 0.2), leak=(0.01, 0.0), limit_nm=(12.0, 50.0))
     error, pol, command, missing = live_run(setup)
     assert missing.sum() == 9

@@ -46,7 +46,7 @@ def residual_between_instants_mas(bench: Bench) -> float:
 
 
 def test_an_image_of_one_instant_hides_the_residual_between_instants() -> None:
-    """It does so for an integrator, and for the law that nulls the residual at the instants."""
+    """The loop is driven by an integrator, then by the law that nulls the residual at the instants."""
     _, bench = wheel(**{"camera.instants": 1})
     bench.run(IDENTIFY)
     assert bench.tilt_mas(MEASURE, continuous=False) == pytest.approx(2.3, rel=0.03)

@@ -172,7 +172,7 @@ def test_a_constant_disturbance_is_rejected() -> None:
 @pytest.mark.parametrize("noise_nm2", [1e-4, 0.7, 100.0])
 @pytest.mark.parametrize("width_hz", [1e-9, 1e-6, 1e-2, 3.0])
 def test_the_covariance_solves_the_riccati_equation(width_hz: float, noise_nm2: float) -> None:
-    """It does so for poles close to the unit circle (narrow lines) and far from it."""
+    """Narrow lines put poles close to the unit circle, wide lines put them further inside."""
     lines = tuple(Line(frequency, width_hz, 1e-3 * frequency) for frequency in (0.3, 6, 6.5, 18, 117))
     model = Model(1e-8, 0.2, lines, noise_nm2, RATE_HZ)
     A, Q, C = model.states()
