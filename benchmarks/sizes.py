@@ -13,7 +13,7 @@ from lowfc.adapters.bus.run import Run
 from lowfc.adapters.files import calibration_file, factory
 from lowfc.adapters.process.realtime import spread
 from lowfc.arrays import Pixels, Single
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.control.calibration.calibration import Calibration
@@ -96,7 +96,7 @@ def random_calibration(size: Size, config: Configuration) -> tuple[Calibration, 
         operator_hash="",
         id="",
     )
-    return identified(calibration), frames.astype(np.uint16).reshape(FRAMES, size.side, size.side)
+    return with_identity(calibration), frames.astype(np.uint16).reshape(FRAMES, size.side, size.side)
 
 
 def prepared_run(size: Size, config: Configuration) -> AbstractContextManager[Run]:

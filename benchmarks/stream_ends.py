@@ -1,6 +1,6 @@
 """Both ends of a stream: a program that writes prepared frames, and a driver that reads them and records their times.
 
-Example: python -m benchmarks.stream_ends FOLDER STREAM FRAMES, with the folder of a run
+Example: python -m benchmarks.stream_ends FOLDER STREAM COUNT, with the folder of a run
 """
 
 import sys
@@ -62,7 +62,7 @@ class TimedCamera(IsioCamera):
         self._written_ns.append(self._newest_ns)
 
     def close(self) -> None:
-        """Save the times; `due_ns` of a frame is the time at which it was written into the stream."""
+        """Save the times; `due_ns` of a frame is its `atime` here, in a frame source it is the scheduled time."""
         super().close()
         np.savez(
             self._folder / SENT_FILE,
@@ -84,14 +84,14 @@ def main() -> None:
     clock = HostClock()
     while not (folder / GO_FILE).exists():
         time.sleep(_POLL_S)
-    due_ns = clock.now_ns() + _LEAD_NS
+    scheduled_ns = clock.now_ns() + _LEAD_NS
     for index in range(count):
         frame = frames[index % len(frames)]
-        clock.sleep_until_ns(due_ns - _WARM_UP_NS)
+        clock.sleep_until_ns(scheduled_ns - _WARM_UP_NS)
         warm_up.put(frame, time.time_ns())
-        clock.sleep_until_ns(due_ns)
+        clock.sleep_until_ns(scheduled_ns)
         stream.put(frame, time.time_ns())
-        due_ns += config.period_ns
+        scheduled_ns += config.period_ns
     time.sleep(_LAST_COMMAND_S)
 
 

@@ -1,4 +1,4 @@
-"""Tables from the code: topics, messages, requests, events, and the limits of the commands."""
+"""Tables from the code: packages, API, topics, messages, requests, events, buttons, thresholds of the commands."""
 
 import ast
 import re
@@ -36,19 +36,19 @@ from tools.shared import ROOT, markdown
 
 API = ("client", "device", "optics", "design", "control")
 """Packages of the Python API."""
-_MESSAGES, _FIELDS = 4, 2  # field numbers of `message_type` and `field`, in protoc's paths of comments
+_MESSAGES, _FIELDS = 4, 2  # field numbers of `message_type` and `field`: protoc stores comments under such paths
 _UNCOMMENTED = {"timestamp": "Time of the reported quantity"}
-_TAKEOVER = (
+_NEW_LAW = (
     ("frames for which a new law observes", SETTLING_FRAMES),
     ("frames of the cross-fade to a new law", FADING_FRAMES),
 )
 _TUNING = (
     ("minimum number of consecutive frames for tuning", FEWEST),
-    ("tilt of an open loop above which it is flagged, mas rms per axis", OPTICAL_GAIN_MAS),
+    ("tilt of an open loop above which `lowfc tune` warns of a low optical gain, mas rms per axis", OPTICAL_GAIN_MAS),
     ("minimum gain margin of an integrator", MIN_GAIN_MARGIN),
     ("minimum phase margin of an integrator, deg", MIN_PHASE_MARGIN_DEG),
     ("lowest integrator gain that `lowfc tune` chooses", LOWEST_GAIN),
-    *_TAKEOVER,
+    *_NEW_LAW,
 )
 _GUARD = (
     ("duration of a block, s, unless the minimum number of frames takes longer", guard.BLOCK_S),
@@ -62,22 +62,25 @@ _GUARD = (
     ("time constant of the long-term mean square, s", guard.LONG_TERM_S),
     ("duration of a cross-fade, s", guard.CROSS_FADE_S),
     ("law is far better if mean squared error / that of the integrator is below", guard.BETTER_RATIO),
-    ("time for which the law must be far better, at first, s", guard.BETTER_S),
+    (
+        "time for which the law must be far better before it drives again, s; it doubles with each takeover",
+        guard.BETTER_S,
+    ),
     ("takeovers by the integrator after which only an operator reactivates the law", guard.MAX_TAKEOVERS),
 )
 _ACCEPTANCE = (
     (
-        "rejection: minimum ratio of tolerance to standard error at which a line (frequency) is evaluated",
+        "rejection: minimum ratio of tolerance to standard error at which a probed frequency is evaluated",
         transfer_function.SIGMAS,
     ),
-    ("rejection: minimum fraction of a mode's lines that are evaluated", acceptance_rejection.MIN_JUDGED),
+    ("rejection: minimum fraction of a mode's probed frequencies that are evaluated", acceptance_rejection.MIN_JUDGED),
     ("linearity: amplitudes, times `linear_nm`", *acceptance_linearity.AMPLITUDES),
-    ("linearity: standard errors above the limit at which a value fails", linearity.SIGMAS),
+    ("linearity: a value fails if it exceeds its limit by more than this number of standard errors", linearity.SIGMAS),
     ("capture-range: amplitudes, times the required one", *acceptance_capture.SIZES),
     ("capture-range: maximum fraction of a shape that remains", linearity.MAX_RESIDUAL),
 )
 _OPERATING = (
-    *_TAKEOVER,
+    *_NEW_LAW,
     ("frames or steps queued for a Python program, at most", stream.WAITING),
     ("size of a request, at most, MB", max_bytes("law") / 1e6),
 )

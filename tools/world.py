@@ -17,7 +17,7 @@ from tools.shared import Results, markdown
 
 SENSORS, MAGNITUDES = ("sam27d10_bal14", "zwfs"), (2, 5)
 PRESET, RATE_HZ, SECONDS = "bench", 500.0, 4.0
-_UNTIL_GAINS_S = 2.5  # simulated before the automatic gains are read; longer than their first window
+_UNTIL_GAINS_S = 2.5  # simulated before the automatic gains are read; longer than the first window of their estimate
 _FRAMES = 2000  # averaged for the dark and for the reference image
 WHEEL = {"disturbance.wheel_hz": 12.0}
 CASES: dict[str, dict[str, Any]] = {

@@ -1,4 +1,4 @@
-"""Calibrations, laws and probe tables on topics of their own; requests and states contain only their identities."""
+"""Calibrations, laws and probe sequences on topics of their own; requests and states contain only their identities."""
 
 import contextlib
 from dataclasses import dataclass, field
@@ -17,14 +17,14 @@ TOPICS = (CALIBRATION, LAW, PLAY)
 
 @dataclass(slots=True)
 class Published:
-    """Calibrations, laws and tables of probe sequences received so far, by identity."""
+    """Calibrations, laws and probe sequences received so far, by identity (a hash of the content)."""
 
     calibrations: dict[str, Calibration] = field(default_factory=dict)
     laws: dict[str, LinearLaw] = field(default_factory=dict)
     plays: dict[str, PlayTable] = field(default_factory=dict)
 
     def store(self, topic: Topic, payload: bytes) -> None:
-        """Store a received message of `TOPICS`; ignore an incomplete message, whose identity then stays unknown."""
+        """Store a received message of `TOPICS`; ignore an incomplete or damaged one: its identity stays unknown."""
         with contextlib.suppress(DecodeError, ValueError):
             if topic is CALIBRATION:
                 calibration = decode_calibration(wire.Calibration.FromString(payload))

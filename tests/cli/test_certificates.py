@@ -235,16 +235,16 @@ def test_certificates_are_warned_about_before_they_expire(tmp_path: Path) -> Non
 
 def test_errors_name_the_file_or_option_at_fault(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="by which other hosts reach it"):
-        make(tmp_path / "none", (ROUTER,), [])
+        make(tmp_path / "empty", (ROUTER,), [])
     with pytest.raises(ConfigurationError, match=r"without port; got 'host:7447'"):
-        make(tmp_path / "none", (ROUTER,), ["host:7447"])
-    with pytest.raises(ConfigurationError, match="none has no authority whose certificates could be renewed"):
-        make(tmp_path / "none", (ROUTER,), ["host"], renew=True)
-    assert not (tmp_path / "none").exists()
+        make(tmp_path / "empty", (ROUTER,), ["host:7447"])
+    with pytest.raises(ConfigurationError, match="empty has no authority whose certificates could be renewed"):
+        make(tmp_path / "empty", (ROUTER,), ["host"], renew=True)
+    assert not (tmp_path / "empty").exists()
     make(tmp_path / "old", (ROUTER,), ["host", "10.0.0.1"])
     assert make(tmp_path / "old", (ROUTER,), ["10.0.0.1"]) == []
-    with pytest.raises(ConfigurationError, match=r"not for other, 10\.0\.0\.2: renew it"):
-        make(tmp_path / "old", (ROUTER,), ["host", "other", "10.0.0.2"])
+    with pytest.raises(ConfigurationError, match=r"not for host2, 10\.0\.0\.2: renew it"):
+        make(tmp_path / "old", (ROUTER,), ["host", "host2", "10.0.0.2"])
     with pytest.raises(DataFileError, match=r"no certificates can be written in .*xxx: File name too long"):
         make(tmp_path / ("x" * 300), ("camera",), [])
     make(tmp_path / "half", ("camera",), [])

@@ -27,7 +27,7 @@ from lowfc.client.runs import absence, waiting_message
 from lowfc.client.stream import WAITING, frame_of, step_of
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.bench_codec import decode_bench_value
-from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
+from lowfc.contract.codecs.calibration_codec import encode_calibration, with_identity
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import count_of, sequence_of
 from lowfc.contract.errors import BusError, CalibrationError, ConfigurationError, DataFileError, RequestRefusedError
@@ -60,7 +60,7 @@ from tests.support.loops import json_of, lowfc, until
 from tests.support.recording import Bench, bodies_of, put
 from tests.support.toy import NOLL, calibration
 
-LOADED = identified(calibration())
+LOADED = with_identity(calibration())
 LAW = law_from_blocks([integrator_block(0.2, 0.01, "pol", 1.5)] * 3, "pol", "leaky", NOLL, 1.5, 1000.0)
 LEASE = {"text": "a test", "lease_id": 7}
 SHAPE = np.arange(20.0).reshape(LOADED.grid)

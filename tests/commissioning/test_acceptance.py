@@ -11,7 +11,7 @@ import pytest
 from lowfc.adapters.files.drawing import figure_class, png
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.contract.configuration import FIXED_GAINS
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import REQUEST, wire
@@ -311,7 +311,7 @@ def test_a_log_without_the_law_or_the_table_of_a_probe_sequence_is_refused(tmp_p
 def test_a_test_in_a_log_is_evaluated_with_the_gains_and_the_calibration_of_its_time(tmp_path: Path) -> None:
     night = SyntheticLog().frames(20).request("note", text=OPEN).frames(60)
     night.request("gain", (0.1,)).request("safe").request("clear")
-    night.load(identified(replace(TOY_CALIBRATION, flux_dn=1.0)))
+    night.load(with_identity(replace(TOY_CALIBRATION, flux_dn=1.0)))
     (response,) = responses_in(night.frames(5).write(tmp_path / "night.mcap"))
     assert (response.loop.law.gain[0], response.loop.calibration.id) == (np.float32(0.4), TOY_CALIBRATION.id)
 

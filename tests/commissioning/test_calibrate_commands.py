@@ -17,7 +17,7 @@ from rich.console import Console
 from lowfc.adapters.files import calibration_file, factory
 from lowfc.adapters.process.progress import counting_bar, progress_lines
 from lowfc.arrays import single
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError, RequestRefusedError
 from lowfc.contract.messages import wire
@@ -132,7 +132,7 @@ def test_a_calibration_in_closed_loop_is_loaded_and_the_loop_closed_again(
     noiseless_loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loop, before = noiseless_loop, noiseless_loop.calibration()
-    new_calibration = identified(replace(before, reference=before.reference * np.float32(1.001)))
+    new_calibration = with_identity(replace(before, reference=before.reference * np.float32(1.001)))
     part = Path("night.fits.part.npz")
     refuse = False
 
@@ -256,7 +256,7 @@ def test_the_reference_is_the_present_image(loop: InProcessLoop) -> None:
 
 
 def test_a_saturated_image_is_no_reference(loop: InProcessLoop) -> None:
-    loop.load(identified(replace(loop.calibration(), saturation_dn=float(loop.calibration().dark.max() + 10))))
+    loop.load(with_identity(replace(loop.calibration(), saturation_dn=float(loop.calibration().dark.max() + 10))))
     assert "good pixels at full well" in refusal("calibrate", "reference", "--frames", "16", kind=CalibrationError)
 
 
@@ -431,7 +431,7 @@ def test_too_few_cycles_to_measure_their_scatter_are_refused() -> None:
 
 def test_a_comparison_of_different_sensors_and_a_missing_directory_are_refused(loop: InProcessLoop) -> None:
     calibration_file.save(loop.calibration(), Path("one.fits"))
-    calibration_file.save(identified(replace(loop.calibration(), noll=(2, 3, 5))), Path("other.fits"))
+    calibration_file.save(with_identity(replace(loop.calibration(), noll=(2, 3, 5))), Path("other.fits"))
     error = refusal("calibrate", "--compare", "one.fits", "other.fits", kind=CalibrationError)
     assert re.search("cannot be compared: .* modes Z2 to Z4, the second .* modes Z2 to Z5", error)
     error = refusal("calibrate", "--method", "hadamard", "--out", "nowhere/night.fits", kind=DataFileError)

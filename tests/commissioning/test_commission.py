@@ -13,7 +13,7 @@ import pytest
 
 from lowfc.adapters.files import calibration_file
 from lowfc.arrays import single
-from lowfc.contract.codecs.calibration_codec import camera_settings, identified
+from lowfc.contract.codecs.calibration_codec import camera_settings, with_identity
 from lowfc.contract.configuration import Configuration, Control
 from lowfc.contract.errors import BusError, CalibrationError, DataFileError, RequestRefusedError
 from lowfc.contract.messages import wire
@@ -168,7 +168,7 @@ def test_a_wrong_sign_fails_the_check_with_automatic_gains(bench: Bench, reverse
     good = bench.loop.calibration()
     R = good.reconstructor.copy()
     R[reversed_modes] *= -1
-    bench.loop.load(identified(replace(good, reconstructor=R)))
+    bench.loop.load(with_identity(replace(good, reconstructor=R)))
     attempt = bench.commissioning()
     with bench.loop.reserved("a test"), pytest.raises(CalibrationError, match=r"nm rms, but .* was predicted"):
         attempt._predict_and_close(1.0)
@@ -275,7 +275,7 @@ def test_a_commissioning_is_not_resumed_with_other_modes_or_commands(tmp_path: P
     bench, same = Bench(tmp_path, NOISELESS), calibration_of(NOISELESS.to_toml())
     for other in (
         calibration_of(CONFIG.to_toml()),
-        identified(replace(same, modes_to_actuators=-same.modes_to_actuators)),
+        with_identity(replace(same, modes_to_actuators=-same.modes_to_actuators)),
     ):
         calibration_file.save(other, provisional_path(bench.out))
         with pytest.raises(CalibrationError, match="other modes or mirror commands than the configuration"):

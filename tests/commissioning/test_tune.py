@@ -19,7 +19,7 @@ from lowfc.adapters.files import law_file
 from lowfc.adapters.files.drawing import png
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.client import Answer
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.contract.codecs.law_codec import driving
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import BusError, ConfigurationError, DataFileError, RequestRefusedError
@@ -411,7 +411,7 @@ def test_without_an_answer_the_previous_law_is_restored_or_the_error_says_that_i
 
 def test_a_log_that_is_too_short_is_refused(closed: SyntheticLog, tmp_path: Path) -> None:
     night = closed.copy().request("open")
-    night.load(identified(replace(night.calibration, flux_dn=1.0)))  # frames of the former calibration do not count
+    night.load(with_identity(replace(night.calibration, flux_dn=1.0)))  # frames of the former calibration do not count
     short = night.request("close").frames(700).write(tmp_path / "short.mcap")
     error = refusal("tune", short, kind=DataFileError)
     assert "tuning requires at least 2048 consecutive frames, 2 s; the longest sequence of good" in error

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 from lowfc.adapters.bus.bus import Query, Sample
 from lowfc.adapters.process.clock import HostClock
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.contract.configuration import load
 from lowfc.contract.messages import CAMERA_STATE, FRAME, MIRROR_STATE, RECORD_KEY, REQUEST, image, wire
 from lowfc.device.driver import CameraSettings, camera_state
@@ -58,7 +58,7 @@ class LiveRun(ThreadedRun):
         state = camera_state(settings, self.clock.now_ns())
         self.camera.publisher(CAMERA_STATE).put(state.SerializeToString())
         camera = SimpleNamespace(run=self._expose)
-        self.start(identified(calibration()), "a test", folder / "safe", (camera, self.camera))
+        self.start(with_identity(calibration()), "a test", folder / "safe", (camera, self.camera))
         until(lambda: mirror_states)
 
     def _add_request(self, sample: Sample) -> None:

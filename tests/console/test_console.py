@@ -20,7 +20,7 @@ from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.files import calibration_file, law_file
 from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Answer
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import EVENT, HEALTH, REQUEST, wire
@@ -158,7 +158,7 @@ def test_the_key_of_every_button_sends_its_request(
     monkeypatch.setenv("HOME", str(tmp_path))
     np.save(tmp_path / "shape.npy", np.full(GRID, 3.0))
     law_file.save(LAW, tmp_path / "law.fits")
-    calibration_file.save(identified(calibration()), tmp_path / "calibration.fits")
+    calibration_file.save(with_identity(calibration()), tmp_path / "calibration.fits")
     for name in ORDER:
         typed, expected = BUTTONS[name]
         before = len(run.requests)

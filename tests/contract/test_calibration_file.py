@@ -25,7 +25,7 @@ def calibration(flux_dn: float = 1234.5678901234) -> Calibration:
         for name in ("reference", "response", "dark")
     }
     good = single(rng.random(toy_calibration.good.size) > 0.2)
-    return calibration_codec.identified(
+    return calibration_codec.with_identity(
         replace(toy_calibration, good=good, flux_dn=flux_dn, operator_hash="0a" * 32, **arrays)
     )
 
@@ -94,21 +94,21 @@ def test_files_of_another_kind_are_refused(tmp_path: Path) -> None:
 
 def test_the_identity_depends_on_every_field() -> None:
     original = calibration()
-    assert calibration_codec.identified(original).id == original.id
+    assert calibration_codec.with_identity(original).id == original.id
     assert len(original.id) == 64
     added: dict[str, Any] = {"camera": toy.CAMERA, "actuators_to_modes": np.zeros((3, 20), np.float32)}
     for name in {field.name for field in fields(Calibration)} - {"id"}:
         value = added.get(name, getattr(original, name))
         changed = value if name in added else value[::-1] if isinstance(value, str | tuple) else value + 1
-        assert calibration_codec.identified(replace(original, **{name: changed})).id != original.id, name
+        assert calibration_codec.with_identity(replace(original, **{name: changed})).id != original.id, name
     cameras = toy.CAMERA, replace(toy.CAMERA, time_ns=77, start_s=8)  # another start of the same camera
-    assert len({calibration_codec.identified(replace(original, camera=camera)).id for camera in cameras}) == 1
+    assert len({calibration_codec.with_identity(replace(original, camera=camera)).id for camera in cameras}) == 1
 
 
 def test_actuators_to_modes_are_stored_and_optional(tmp_path: Path) -> None:
     without_matrix, path = calibration(), tmp_path / "night.fits"
     matrix = np.arange(60, dtype=np.float32).reshape(3, 20)
-    with_matrix = calibration_codec.identified(replace(without_matrix, actuators_to_modes=matrix))
+    with_matrix = calibration_codec.with_identity(replace(without_matrix, actuators_to_modes=matrix))
     save(with_matrix, path)
     assert np.array_equal(load(path).actuators_to_modes, matrix)
     assert with_matrix.id != without_matrix.id

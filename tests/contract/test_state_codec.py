@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lowfc.contract.codecs import codec
-from lowfc.contract.codecs.calibration_codec import decode_calibration, encode_calibration, identified
+from lowfc.contract.codecs.calibration_codec import decode_calibration, encode_calibration, with_identity
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
 from lowfc.contract.messages import wire
 from lowfc.control.loop.advance import advance
@@ -35,7 +35,7 @@ def test_a_state_with_the_wrong_calibration_is_refused() -> None:
 
 @pytest.mark.parametrize("field", ["gain", "prior_nm2", "automatic"])
 def test_a_state_with_too_few_modes_is_refused(field: str) -> None:
-    calibration = identified(replace(CALIBRATION, camera=CAMERA))
+    calibration = with_identity(replace(CALIBRATION, camera=CAMERA))
     setup = settings(auto_gain=(True, True))
     gains = Request(0, "gain", values=(0.1, 0.1, 0.0), text=AUTO, prior_nm2=(0.0, 0.0, 4.0), flux_dn=1e5)
     state, _ = feed(setup, State(), Load(0, calibration, "a file"), gains)
@@ -77,7 +77,7 @@ def test_inputs_round_trip(input_: Report) -> None:
 
 
 def test_a_calibration_round_trips() -> None:
-    calibration = identified(replace(CALIBRATION, camera=CAMERA))
+    calibration = with_identity(replace(CALIBRATION, camera=CAMERA))
     message = wire.Calibration.FromString(encode_calibration(calibration, 5_000_000_001))
     assert message.timestamp.ToNanoseconds() == 5_000_000_001
     assert list(message.mode_names) == ["tilt x", "tilt y", "focus"]

@@ -40,10 +40,10 @@ def ask(name: str, *values: float, modes: tuple[int, ...] = ()) -> Request:
     return Request(0, name, modes, values)
 
 
-def image_with_saturated(pixels: int) -> Pixels:
+def image_with_saturated(count: int) -> Pixels:
     """An image with this number of pixels at full well."""
     image = TOY.pixels(WAVE_NM)
-    image.flat[:pixels] = SATURATION_DN
+    image.flat[:count] = SATURATION_DN
     return image
 
 
@@ -116,7 +116,9 @@ def test_without_a_calibration_a_frame_gives_a_step_and_no_command() -> None:
         ({"pixels": image_with_saturated(9)}, (Rejection.SATURATED,)),
     ],
 )
-def test_a_frame_is_refused_only_beyond_a_limit(changes: dict[str, object], reasons: tuple[Reason, ...]) -> None:
+def test_a_frame_is_refused_only_beyond_a_limit_or_with_a_wrong_size(
+    changes: dict[str, object], reasons: tuple[Reason, ...]
+) -> None:
     _, (outputs,) = feed(DEFAULTS, running(), frame(6, WAVE_NM, **changes))
     assert outputs.step.reasons == reasons
     assert (outputs.step.error_nm is None) is bool(reasons)
@@ -199,7 +201,9 @@ def test_before_the_first_command_a_tick_does_nothing_except_in_safe_mode() -> N
     assert outputs == Outputs()
     in_safe_mode, (_, outputs) = feed(DEFAULTS, state, Request(7, "safe"), Tick(7, 0))
     assert not outputs.command.actuators_nm.any()
-    assert outputs.command.clear_id == 7, "so that even a mirror that has applied commands of newer frames accepts it"
+    assert outputs.command.clear_id == 7, (
+        "the time of the request: with a new `clear_id` a mirror accepts any frame sequence"
+    )
     shape = MirrorShape(0, np.ones(GRID, np.float32), np.zeros(3, np.float32))
     assert feed(DEFAULTS, in_safe_mode, shape)[0] is in_safe_mode, "the shape is not adopted"
 
@@ -234,7 +238,7 @@ def test_safe_mode_relaxes_the_mirror_frame_by_frame_within_the_limits() -> None
 
 @pytest.mark.parametrize("reason", [Rejection.OUT_OF_ORDER, Rejection.REPEATED])
 def test_safe_mode_flattens_the_mirror_while_frames_are_refused(reason: Reason) -> None:
-    """The frames are refused; commands have the newest sequence, so that the mirror accepts them."""
+    """The frames are refused; commands have the newest frame sequence, so that the mirror accepts them."""
     state, _ = feed(DEFAULTS, running(), ask("safe"))
     newest = state.frame_sequence
     for _ in range(200):
@@ -306,7 +310,7 @@ def test_gain_and_leak_are_refused_if_unstable_together() -> None:
         assert all(outputs.reply.accepted for outputs in all_outputs)
 
 
-def test_a_request_with_more_leaks_than_modes_is_refused_without_computing_their_gains() -> None:
+def test_a_request_with_more_leaks_than_modes_is_refused_before_limiting_gains_are_computed() -> None:
     before = limiting_gain.cache_info().misses
     _, outputs = feed(DEFAULTS, loaded(DEFAULTS), ask("leak", *np.linspace(0.01, 0.9, 900).tolist()))
     check_reply(outputs[0], False, "give one value, or one per mode (3 modes); got 900")
@@ -339,7 +343,9 @@ def test_in_open_loop_the_command_holds() -> None:
 def test_a_loaded_calibration_does_not_make_the_mirror_jump(noll: tuple[int, ...]) -> None:
     before = running()
     state, (outputs,) = feed(DEFAULTS, before, Load(0, calibration(noll, scale=2.0), "another"))
-    adoption = [] if noll == NOLL else ["SHAPE_ADOPTED"]  # of the part outside the new modes
+    adoption = (
+        [] if noll == NOLL else ["SHAPE_ADOPTED"]
+    )  # the part of the shape outside the new modes becomes a channel
     assert names([outputs]) == ["CALIBRATION_LOADED", *adoption]
     assert np.array_equal(state.loop.actuators_nm, before.loop.actuators_nm)
     _, (outputs,) = feed(DEFAULTS, state, Tick(0, 0))

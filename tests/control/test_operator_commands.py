@@ -9,7 +9,7 @@ import pytest
 
 from lowfc.arrays import Single
 from lowfc.contract.codecs import codec
-from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
+from lowfc.contract.codecs.calibration_codec import encode_calibration, with_identity
 from lowfc.contract.codecs.law_codec import wire_law
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
 from lowfc.contract.events import EVENTS
@@ -28,11 +28,11 @@ from tests.support.toy import DARK_DN, NOLL, SATURATION_DN, SHAPE, START, calibr
 REQUEST_COUNT = 40
 """Number of requests in each run."""
 TIGHT: dict[str, object] = {"limit_nm": (40.0, 15.0), "max_saturated_pixels": 0}
-CALIBRATION = identified(calibration())
+CALIBRATION = with_identity(calibration())
 TO_MODES = np.linalg.pinv(CALIBRATION.modes_to_actuators)
-OTHERS = tuple(identified(calibration(noll, scale)) for noll, scale in ((NOLL, 1.1), ((2, 3), 1.0), ((2,), 0.9)))
+OTHERS = tuple(with_identity(calibration(noll, scale)) for noll, scale in ((NOLL, 1.1), ((2, 3), 1.0), ((2,), 0.9)))
 """Calibrations that replace `CALIBRATION`: another response, and fewer modes."""
-OTHER_MIRROR = identified(replace(CALIBRATION, grid=(5, 4)))
+OTHER_MIRROR = with_identity(replace(CALIBRATION, grid=(5, 4)))
 CALIBRATIONS_BY_ID = {each.id: each for each in (CALIBRATION, *OTHERS, OTHER_MIRROR)}
 HUGE = 3e38
 STATIC_NM = (12.0, -8.0, 5.0)

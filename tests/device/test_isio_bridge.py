@@ -10,7 +10,7 @@ import pytest
 
 from lowfc.adapters.bus.bus import Query
 from lowfc.adapters.image_stream.stream import StreamError
-from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
+from lowfc.contract.codecs.calibration_codec import encode_calibration, with_identity
 from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, REQUEST_KEY, STEP, wire
 from lowfc.programs.bridge import isio as bridge
@@ -91,7 +91,7 @@ def test_other_channels_are_reported_to_the_loop(case: str, folder: Path, monkey
     """
     hub, clock, received = MemoryHub(), FakeClock(AT_NS), list[wire.Request]()
     controller = MemoryBus(hub, "controller", clock)
-    controller.publisher(CALIBRATION).put(encode_calibration(identified(calibration()), 0))
+    controller.publisher(CALIBRATION).put(encode_calibration(with_identity(calibration()), 0))
     states = controller.publisher(CONTROLLER_STATE)
     started = wire.ControllerState(mirror_rows=GRID[0], mirror_columns=GRID[1]).SerializeToString()
     if case != "controller-late":

@@ -20,7 +20,7 @@ from lowfc.adapters.files import calibration_file, factory, law_file
 from lowfc.adapters.logs.writer import Attachment
 from lowfc.adapters.process.provenance import provenance
 from lowfc.client import Client
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import RequestRefusedError
@@ -198,7 +198,7 @@ def main(folder: Path) -> None:
     night.expose(3)
     loop.reset()
     night.expose(2)
-    loop.load(identified(replace(calibration, reconstructor=calibration.reconstructor * np.float32(0.9))))
+    loop.load(with_identity(replace(calibration, reconstructor=calibration.reconstructor * np.float32(0.9))))
     loop.close_loop()
     night.expose(2)
     night.clock.advance(1_000_000_000)

@@ -20,7 +20,7 @@ from lowfc.adapters.logs.history import History
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import damage_in_words
 from lowfc.arrays import Array
-from lowfc.contract.codecs.calibration_codec import identified, wire_camera
+from lowfc.contract.codecs.calibration_codec import wire_camera, with_identity
 from lowfc.contract.codecs.codec import decode_frame
 from lowfc.contract.codecs.state_codec import calibration_in_use
 from lowfc.contract.configuration import Configuration
@@ -52,7 +52,7 @@ STEPS, REFUSED, WITHOUT_COMMAND, WITHOUT_TRUTH = 30, 4, 7, 9  # number of steps,
 MODES, ACTUATORS = len(toy.NOLL), toy.GRID[0] * toy.GRID[1]
 QUIET = Console(quiet=True)
 GOOD = np.arange(toy.SHAPE[0] * toy.SHAPE[1]) != 10  # one bad pixel
-CALIBRATED = identified(replace(toy.calibration(), good=GOOD.astype(np.float32)))
+CALIBRATED = with_identity(replace(toy.calibration(), good=GOOD.astype(np.float32)))
 
 
 def a_night() -> SyntheticLog:

@@ -9,7 +9,7 @@ import pytest
 
 from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.contract.envelope import sequence_of
 from lowfc.contract.messages import (
     CALIBRATION,
@@ -64,7 +64,7 @@ def test_the_attached_calibration_replaces_a_lost_message(tmp_path: Path) -> Non
     assert history.calibration.id == complete.calibration.id
     np.testing.assert_equal(history.steps.error_nm, complete.steps.error_nm)
     assert history.remarks == [f"{history.log.path}: the message of its calibration is lost; the attached one is used"]
-    other = identified(calibration(NOLL, 2.0))  # no controller reported using it
+    other = with_identity(calibration(NOLL, 2.0))  # no controller reported using it
     for name, attached in (("none", None), ("other", other)):
         history = read_history(LogReader(night.write(tmp_path / f"{name}.mcap", attached=attached)))
         assert history.calibration is None

@@ -18,7 +18,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process import compiled
 from lowfc.adapters.process.provenance import provenance
 from lowfc.contract.codecs import codec
-from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
+from lowfc.contract.codecs.calibration_codec import encode_calibration, with_identity
 from lowfc.contract.codecs.law_codec import wire_law, wire_play
 from lowfc.contract.codecs.state_codec import controller_state
 from lowfc.contract.envelope import sequence_of
@@ -326,7 +326,7 @@ def test_a_recording_that_begins_in_the_middle_of_a_run_lacks_no_input() -> None
     assert account.inputs_missing == 0
 
 
-OTHER = identified(calibration(NOLL, 2.0))
+OTHER = with_identity(calibration(NOLL, 2.0))
 
 
 @pytest.mark.parametrize(

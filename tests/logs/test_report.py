@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.logs.recovery import recover
-from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
+from lowfc.contract.codecs.calibration_codec import encode_calibration, with_identity
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import (
@@ -424,7 +424,7 @@ def test_a_loop_without_a_calibration_has_no_residual(tmp_path: Path) -> None:
 def test_a_calibration_of_other_modes_leaves_out_former_steps_only_if_it_is_the_last(tmp_path: Path) -> None:
     """Frames of steps that are left out still led to commands."""
     night = SyntheticLog().frames(100)
-    two = encode_calibration(identified(calibration(NOLL[:2])), night.now_ns)
+    two = encode_calibration(with_identity(calibration(NOLL[:2])), night.now_ns)
     night.put(CALIBRATION, two)  # refused: the controller publishes the one in use again
     night.put(CALIBRATION, encode_calibration(night.calibration, night.now_ns))
     night.frames(100)
@@ -438,7 +438,7 @@ def test_a_calibration_of_other_modes_leaves_out_former_steps_only_if_it_is_the_
 def test_the_analysed_stretch_is_under_the_calibration_loaded_last(tmp_path: Path) -> None:
     night, other = SyntheticLog(), replace(TOY_CALIBRATION, reconstructor=0.9 * TOY_CALIBRATION.reconstructor)
     night.frames(500).request("open").frames(50).request("close")
-    night.load(identified(other))
+    night.load(with_identity(other))
     why = results_of(night.write(tmp_path / "before.mcap"))["spectra"]["why_not"]
     assert why == "the loop was closed only under an earlier calibration than the last one of this log"
     night.frames(300)

@@ -16,7 +16,7 @@ from lowfc.adapters.logs.columns import Steps
 from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import Damage
-from lowfc.contract.codecs.calibration_codec import identified, wire_camera
+from lowfc.contract.codecs.calibration_codec import wire_camera, with_identity
 from lowfc.contract.codecs.state_codec import calibration_in_use
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError
@@ -277,7 +277,7 @@ def test_another_reconstructor_measures_the_same_frames(runs: dict[str, LoggedRu
     I0, H, good = (array.astype(float) for array in (calibration.reference, calibration.response, calibration.good))
     R = reconstructor(I0, H, good, 1.0, 0.0, "pinv").astype(np.float32)
     path = tmp_path / "pinv.fits"
-    calibration_file.save(identified(replace(calibration, reconstructor=R, estimator="pinv")), path)
+    calibration_file.save(with_identity(replace(calibration, reconstructor=R, estimator="pinv")), path)
     by_file = results_of(runs["default"], requested_changes(calibration=path))
     np.testing.assert_allclose(column(by_file, "what_if"), column(by_name, "what_if"), rtol=1e-4)
     weighted = results_of(runs["default"], requested_changes("estimator=weighted", calibration=path))
@@ -324,14 +324,14 @@ def test_commands_are_converted_to_modes_of_another_scale(runs: dict[str, Logged
         reconstructor=calibration.reconstructor / 2,
         modes_to_actuators=calibration.modes_to_actuators * 2,
     )
-    calibration_file.save(identified(twice), tmp_path / "twice.fits")
+    calibration_file.save(with_identity(twice), tmp_path / "twice.fits")
     results = results_of(runs["default"], requested_changes(calibration=tmp_path / "twice.fits"))
     np.testing.assert_allclose(column(results, "what_if"), column(results, "was") / 2, rtol=1e-4)
 
 
 def test_calibrations_that_do_not_fit_are_refused(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
     path = tmp_path / "other.fits"
-    calibration_file.save(identified(replace(toy.calibration(), noll=(2, 3, 11))), path)
+    calibration_file.save(with_identity(replace(toy.calibration(), noll=(2, 3, 11))), path)
     with pytest.raises(CalibrationError, match=r"its noll is \(2, 3, 11\), in the log it is \(2, 3, 4\)"):
         results_of(runs["default"], requested_changes(calibration=path))
     (tmp_path / "shear.toml").write_text('[control]\nnuisance = ["shear"]\n')

@@ -20,7 +20,7 @@ from lowfc.adapters.files import calibration_file
 from lowfc.adapters.logs.writer import LogWriter
 from lowfc.adapters.process.latch import NAME, Latch
 from lowfc.adapters.process.service import Service
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import Envelope
 from lowfc.contract.errors import LowfcError
@@ -90,7 +90,7 @@ class ToyBench(ChaosBench):
         path.mkdir()
         self.run: Any = SimpleNamespace(path=path, run_id="toy", links=None, remove=lambda: None)
         file = path / "calibration.fits"
-        calibration_file.save(identified(calibration()), file)
+        calibration_file.save(with_identity(calibration()), file)
         pids = {Role.CAMERA: CAMERA_PID, Role.CONTROLLER: CAMERA_PID + 1}
         self.children: Any = {
             name: SimpleNamespace(

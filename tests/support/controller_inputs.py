@@ -3,12 +3,12 @@
 import numpy as np
 from hypothesis import strategies as st
 
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.control.loop.inputs import CameraSettings, Input, MirrorShape, Request, Tick
 from lowfc.control.loop.interlocks import Action, BenchReport, Interlock
 from tests.support.toy import NOLL, calibration, frame
 
-CALIBRATION = identified(calibration())
+CALIBRATION = with_identity(calibration())
 INTERLOCKS = (
     Interlock("mask", "equal", True, Action.HOLD, 1000),
     Interlock("mask", "different", "parked", Action.OPEN, 2000, acts_when_old=False),

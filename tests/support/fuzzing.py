@@ -1,4 +1,4 @@
-"""Feed damaged inputs to readers; detect crashes, hangs and memory growth: python -m tests.support.fuzzing --help."""
+"""Feed damaged inputs to readers; find crashes, hangs and memory growth: python -m tests.support.fuzzing --help."""
 
 import argparse
 import json
@@ -29,7 +29,7 @@ class HungError(BaseException):
 
 
 def fuzz(target: Target, numbers: range) -> dict[str, Any]:
-    """Feed inputs of these numbers to a target.
+    """Feed a target the inputs with these numbers.
 
     Returns:
         name, inputs, refused (inputs with a permitted error), crashes (number, error), hangs (number), grown_bytes.

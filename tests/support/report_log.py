@@ -13,7 +13,7 @@ from lowfc.adapters.files import calibration_file
 from lowfc.adapters.logs.writer import Attachment, LogWriter
 from lowfc.arrays import Pixels, Single
 from lowfc.contract.codecs import codec
-from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
+from lowfc.contract.codecs.calibration_codec import encode_calibration, with_identity
 from lowfc.contract.codecs.law_codec import wire_law
 from lowfc.contract.codecs.state_codec import controller_state
 from lowfc.contract.configuration import Configuration
@@ -46,7 +46,7 @@ from lowfc.control.loop.inputs import Frame, Load, Outputs, Request
 from lowfc.control.loop.state import State
 from tests.support.toy import FLUX_DN, NOLL, PERIOD_NS, SHAPE, START, TOY, calibration, settings
 
-TOY_CALIBRATION = identified(calibration())
+TOY_CALIBRATION = with_identity(calibration())
 DELAY_NS = 300_000  # from a frame to its command
 READ_NOISE_E = 2.0
 METADATA = {"lowfc": {"lowfc": "0.1.0", "numpy": "2.0", "host": "bench", "run": "night", "seed": "5"}}

@@ -1,4 +1,4 @@
-"""Helpers for the display: a scripted run of `tests.support.toy`, and a stream that stores what is drawn."""
+"""Helpers for tests of the view: a scripted run of the toy sensor, and a stream that stores what is drawn."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable
@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.arrays import Array
-from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
+from lowfc.contract.codecs.calibration_codec import encode_calibration, with_identity
 from lowfc.contract.envelope import sequence_of
 from lowfc.contract.messages import (
     CALIBRATION,
@@ -90,7 +90,7 @@ class Stage:
         self.accumulator.add(Sample(topic.at(name), payload, 0, self.host_ns, self.host_ns))
 
     def begin(self) -> None:
-        self.send(CALIBRATION, encode_calibration(identified(calibration()), self.data_ns))
+        self.send(CALIBRATION, encode_calibration(with_identity(calibration()), self.data_ns))
         settings = wire.ControllerSettings(stroke_nm=700.0, min_flux_fraction=0.2)
         self.send(CONTROLLER_STATE, wire.ControllerState(mode=self.mode.value, settings=settings))
         self.send(CAMERA_STATE, wire.CameraState(period_ns=20_000_000))
@@ -149,7 +149,7 @@ class Stage:
 
 
 class Tape:
-    """Stand-in for rerun's RecordingStream, which stores what is drawn.
+    """Stand-in for rerun's RecordingStream; it stores what is drawn.
 
     Attributes:
         now_ns: time of the next logged item.

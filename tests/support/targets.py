@@ -22,7 +22,7 @@ from lowfc.adapters.process.service import Service
 from lowfc.contract import configuration
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.bench_codec import decode_bench_value, encode_bench_value
-from lowfc.contract.codecs.calibration_codec import decode_calibration, encode_calibration, identified
+from lowfc.contract.codecs.calibration_codec import decode_calibration, encode_calibration, with_identity
 from lowfc.contract.codecs.law_codec import wire_law
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
 from lowfc.contract.configuration import Configuration, load
@@ -317,7 +317,7 @@ def _bytes_of(save: Callable[[Path], object], path: Path) -> tuple[bytes]:
 
 
 def _files(folder: Path) -> list[Target]:
-    with_modes = identified(replace(CALIBRATION, actuators_to_modes=np.ones((len(NOLL), 20), np.float32)))
+    with_modes = with_identity(replace(CALIBRATION, actuators_to_modes=np.ones((len(NOLL), 20), np.float32)))
     fits = tuple(calibration_file.to_bytes(each) for each in (CALIBRATION, with_modes))
     laws = _bytes_of(partial(law_file.save, LAW), folder / "law.fits")
     pupils = _bytes_of(lambda path: np.savez(path, quarter=np.ones((2, 2))), folder / "pupil.npz")

@@ -10,8 +10,8 @@ from lowfc.contract.messages import Rate, Topic
 class Backlog:
     """Queue from the bus's threads to a writing thread.
 
-    A message that does not fit is dropped, and its missing sequence counts as a loss. Messages of queryable topics and
-    of topics published on events are never dropped: they are few, and needed to interpret the others.
+    A message that does not fit is dropped, and its missing sequence number counts as a loss. Messages of queryable
+    topics and of topics published on events are never dropped: they are few, and needed to interpret the others.
     """
 
     def __init__(self, max_messages: int, max_bytes: int) -> None:

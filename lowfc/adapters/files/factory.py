@@ -13,7 +13,7 @@ from lowfc.adapters.files.mirror_maps import active_actuators
 from lowfc.adapters.files.sensors import coronagraph_from, sensor_from
 from lowfc.adapters.files.twin_cache import load_or_build, load_or_compute_form, load_or_fit_mirror
 from lowfc.arrays import Array, single
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError, LowfcError, raised_as
 from lowfc.contract.messages import fields_of
@@ -220,7 +220,7 @@ def analytic_calibration(
         sensed[:, ~active.reshape(-1)] = 0
     commands = commands @ np.linalg.inv(sensed @ commands)
 
-    return identified(
+    return with_identity(
         Calibration(
             noll=nolls,
             reference=single(I0),

@@ -62,8 +62,8 @@ def set_up(priority: int | None, cpus: set[int] | None, *, lock_memory: bool, di
         measures.append(("locked memory", _lock_memory, cost))
     if disable_cpu_idle:
         cost = (
-            "a processor that sleeps between frames takes tens of microseconds longer to wake, several times a "
-            f"frame; let this user write to {_LATENCY_DEVICE}"
+            "an idle processor takes tens of microseconds longer to wake, and wakes several times in each frame; "
+            f"let this user write to {_LATENCY_DEVICE}"
         )
         measures.append(("processors awake", _disable_cpu_idle, cost))
     cost = (
@@ -78,7 +78,7 @@ def use_huge_pages() -> Granted:
 
     Call it once the process is ready: it stops the process for some 50 ms, and does not move later allocations.
     """
-    cost = "every frame takes longer; it needs Linux 6.1"
+    cost = "every frame takes longer; huge pages need Linux 6.1"
     return _request([], [("huge pages", _collapse_memory, cost)])
 
 
@@ -86,9 +86,9 @@ def spread(cpus: Iterable[int], *, simulated: bool = True) -> dict[str, list[int
     """Configuration keys that distribute the loop's processes over these processors; no key for a single processor.
 
     The controller gets its own processor if possible: other processes would evict its code and data from the caches,
-    and the recorder, which receives each frame at the same time, would run before it. With two processors, a simulated
-    camera needs one, and the recorder may use both: on a processor whose real-time share is used up, it would stop for
-    50 ms.
+    and the recorder, which receives each frame at the same time, could run before it. With two processors, a simulated
+    camera needs one, and the recorder may use both: the kernel would stop it for 50 ms on a processor whose real-time
+    share is used up.
 
     Args:
         cpus: available processors.
@@ -112,8 +112,8 @@ def set_up_below_loop(priority: int | None, cpus: set[int] | None) -> Granted:
     """Set up a process that must keep up with the loop but never delay it, such as the recorder.
 
     Its SCHED_FIFO priority, if granted, is below the loop's and above everything else: in the normal class on a busy
-    host, a recorder loses messages of a 1 kHz loop. If none is requested, the process is in the batch class, in which a
-    message that arrives does not interrupt the loop to wake it.
+    host, a recorder loses messages of a 1 kHz loop. If none is requested, the process is in the batch class: when a
+    message wakes it, it does not preempt the loop.
     """
     leave_real_time()
     measures: list[_Measure] = []
@@ -128,8 +128,9 @@ def set_up_below_loop(priority: int | None, cpus: set[int] | None) -> Granted:
 def yield_to_sender() -> None:
     """Yield so that the bus's thread sends the last put before this thread continues.
 
-    With equal SCHED_FIFO priority on the same processor, the bus's thread would wait until this one sleeps. So would
-    the mirror and its bus thread, hence the second yield. In the normal class the kernel schedules these threads, and
+    With equal SCHED_FIFO priority on the same processor, the bus's thread would wait until this one sleeps. A mirror's
+    process on this processor (if there are only two) would wait in the same way: the second yield lets it apply the
+    command. In the normal class the kernel schedules these threads, and
     yielding would let any process run.
     """
     if os.sched_getscheduler(0) == os.SCHED_FIFO:
@@ -189,7 +190,7 @@ def _disable_cpu_idle() -> None:
 def _lock_memory() -> None:
     """Lock resident pages, all pages of mapped files (reading them later is slow), and other pages once touched.
 
-    Locking all reserved memory would allocate it: most of it is buffers and thread stacks that BLAS does not use.
+    Locking all reserved memory would allocate it: most of it is reserved by BLAS for threads that do not run here.
     Under a memory-lock limit nothing is locked, as later allocations would fail.
     """
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]

@@ -33,7 +33,7 @@ def encode_calibration(calibration: Calibration, time_ns: int) -> bytes:
     return message.SerializeToString()
 
 
-def identified(calibration: Calibration) -> Calibration:
+def with_identity(calibration: Calibration) -> Calibration:
     """The calibration with its correct `id`, see `Calibration.identity`."""
     return replace(calibration, id=calibration.identity())
 

@@ -1,4 +1,4 @@
-"""Dark and bad pixels from frames without light."""
+"""The dark, and a map of bad pixels, from frames without light."""
 
 from typing import NamedTuple
 
@@ -48,7 +48,7 @@ class Dark(NamedTuple):
 
 
 def measure_dark(frames: npt.NDArray[np.number]) -> Dark:
-    """Dark and bad pixels from frames (frames, pixels) without light, DN.
+    """The dark, and bad pixels, from frames (frames, pixels) without light, DN.
 
     Raises:
         ValueError: there are too few frames, values are not finite, or the frames are not dark.
@@ -64,7 +64,7 @@ def measure_dark(frames: npt.NDArray[np.number]) -> Dark:
     level, typical_noise = float(np.median(mean)), float(np.median(noise))
     mean_spread = max(_robust_std(mean), typical_noise / np.sqrt(count), 1e-3)
     noise_spread = max(_robust_std(noise), typical_noise / np.sqrt(2 * count), 1e-3)
-    rounding_dn = _ROUNDING_DN * (1 + 4 / np.sqrt(count))  # in few frames, all values of a good pixel may be equal
+    rounding_dn = _ROUNDING_DN * (1 + 4 / np.sqrt(count))  # rounding may hide a good pixel's noise in few frames
     hot = mean > level + max(_SIGMAS * mean_spread, _SIGMAS * typical_noise / 4, rounding_dn)
     if hot.mean() > 0.05:
         raise ValueError(

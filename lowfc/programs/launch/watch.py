@@ -74,7 +74,7 @@ def summary(watch: Watch, record: bool, lockstep_hz: float | None = None) -> dic
         recorder = watch.health_of(Role.RECORDER)
         recording, frames_in_log = recorder.recording, topic_count(recorder, FRAME.key)
         lost = {topic.topic: topic.missing for topic in recorder.topics if topic.missing}
-        # Without the camera's last Health, the recorder cannot count frames lost after the last recorded one.
+        # A recorder that misses the camera's last Health does not count frames lost after the last recorded one.
         uncounted = results["frames_published"] - frames_in_log.received - frames_in_log.missing
         if frames_in_log.received and uncounted > 0:
             lost[FRAME.key] = frames_in_log.missing + uncounted

@@ -33,15 +33,15 @@ def integrator_of_tip(gain: float, delay: float) -> LinearLaw:
 def test_the_residual_power_of_a_wave_agrees_with_a_fine_simulation(timing: Timing, omega: float) -> None:
     frames, fine, weights = 1500, (np.arange(FINE) + 0.5) / FINE, delay_weights(timing.delay)
 
-    def wave(times: Array) -> Array:
+    def sinusoid(times: Array) -> Array:
         return np.sqrt(2) * np.cos(omega * times + 1)
 
     c, squares = np.zeros(frames), []
     for k in range(frames):
         seen = sum(weight * c[k - 1 - lag] for lag, weight in enumerate(weights))
-        c[k] = c[k - 1] - 0.4 * (wave(k + fine[fine < timing.exposure]).mean() + seen)
+        c[k] = c[k - 1] - 0.4 * (sinusoid(k + fine[fine < timing.exposure]).mean() + seen)
         if k > frames // 2:
-            squares.append(np.mean((wave(k + timing.applied + fine) + c[k]) ** 2))
+            squares.append(np.mean((sinusoid(k + timing.applied + fine) + c[k]) ** 2))
     residual_nm2 = residual_power(integrator_of_tip(0.4, timing.delay), np.array([omega]), timing)[0, 0]
     assert residual_nm2 == pytest.approx(np.mean(squares), rel=0.01)
 
@@ -50,13 +50,13 @@ def test_the_residual_power_of_a_wave_agrees_with_a_fine_simulation(timing: Timi
 def test_the_mirror_moves_within_the_exposure_that_sees_parts_of_two_commands(delay: float, exposure: float) -> None:
     """In the simulation with fine steps, an exposure sees the motion of the mirror."""
     frames, omega, timing = 800, 0.11, Timing.of(delay, exposure)
-    wave = np.sqrt(2) * np.cos(omega * np.arange(frames * FINE) / FINE + 1)
+    sinusoid = np.sqrt(2) * np.cos(omega * np.arange(frames * FINE) / FINE + 1)
     mirror, c = np.zeros(frames * FINE), 0.0
     for k in range(frames):
         exposed = slice(k * FINE, k * FINE + round(exposure * FINE))
-        c -= 0.3 * np.mean(wave[exposed] + mirror[exposed])
+        c -= 0.3 * np.mean(sinusoid[exposed] + mirror[exposed])
         mirror[k * FINE + round(timing.applied * FINE) :] = c
-    residual_nm2 = np.mean((wave + mirror)[frames // 4 * FINE :] ** 2)
+    residual_nm2 = np.mean((sinusoid + mirror)[frames // 4 * FINE :] ** 2)
     theory_nm2 = residual_power(integrator_of_tip(0.3, delay), np.array([omega]), timing)[0, 0]
     assert theory_nm2 == pytest.approx(residual_nm2, rel=0.01)
 
@@ -64,14 +64,14 @@ def test_the_mirror_moves_within_the_exposure_that_sees_parts_of_two_commands(de
 def test_the_floor_is_the_residual_of_the_best_held_value() -> None:
     t = np.linspace(0, 1, 20_001)
     for omega in (0.1, 1.0, 4.0):
-        wave = np.exp(1j * omega * t)
-        residual = np.trapezoid(np.abs(wave - np.trapezoid(wave, t)) ** 2, t)
+        sinusoid = np.exp(1j * omega * t)
+        residual = np.trapezoid(np.abs(sinusoid - np.trapezoid(sinusoid, t)) ** 2, t)
         assert hold_floor(np.array([omega]))[0] == pytest.approx(residual, rel=1e-4)
     assert mean_over(np.zeros(1), 1.0)[0] == 1
 
 
 def test_laws_leave_the_documented_residuals_on_the_ideal_wheel_and_the_best_law_reaches_the_floor() -> None:
-    """Residuals are in mas per axis, without noise. At instants the integrator leaves 2.26, the best law nothing."""
+    """Residuals are in mas per axis, without noise."""
     instant, blurred = Timing(1, 1, 0), Timing(1, 1, 0.5)
     assert residual_mas(integrator_of_tip(1.11, 1), instant) == pytest.approx(3.528, abs=0.002)
     assert residual_mas(integrator_of_tip(1.11, 1), blurred) == pytest.approx(2.944, abs=0.002)
@@ -81,7 +81,7 @@ def test_laws_leave_the_documented_residuals_on_the_ideal_wheel_and_the_best_law
         assert residual_mas(lqg([WHEEL], (2,), timing), timing) == pytest.approx(floor_mas(), rel=0.02), timing
 
 
-def test_a_law_that_nulls_another_mean_than_that_under_its_command_has_a_larger_residual() -> None:
+def test_a_law_for_another_interval_than_that_of_its_command_has_a_larger_residual() -> None:
     instant, blurred = Timing(1, 1, 0), Timing(1, 1, 0.5)
     assert residual_mas(kalman(instant, 1.0, 0.0), instant) == pytest.approx(1.44, abs=0.01)
     assert residual_mas(kalman(blurred, 1.0, 0.5), blurred) == pytest.approx(0.954, abs=0.01)
@@ -95,12 +95,12 @@ def test_the_noise_of_an_integrators_command_has_a_closed_form() -> None:
 
 @pytest.mark.parametrize("timing", [Timing(1, 1, 0), Timing(1, 1, 0.5), Timing(2, 2, 0.9), Timing(1.3, 1.3, 0.5)])
 def test_means_while_commands_are_in_force_are_interpolated_from_measurements(timing: Timing) -> None:
-    """The means are those of waves with frequencies up to a quarter of the frame rate."""
+    """The means are those of sinusoids with frequencies up to a quarter of the frame rate."""
     k = np.arange(400)
     for omega in (0.0, 0.04, 0.5, 1.5):
-        wave = np.exp(1j * (omega * k + 0.3))
-        measured = wave * mean_over(np.array([omega]), timing.exposure)
-        true_means = wave * mean_over(np.array([omega]), 1.0) * np.exp(1j * omega * timing.applied)
+        sinusoid = np.exp(1j * (omega * k + 0.3))
+        measured = sinusoid * mean_over(np.array([omega]), timing.exposure)
+        true_means = sinusoid * mean_over(np.array([omega]), 1.0) * np.exp(1j * omega * timing.applied)
         means, response = means_while_applied(measured.real[:, None], timing)
         valid = np.isfinite(means[:, 0])
         assert valid.sum() > 290
@@ -109,28 +109,28 @@ def test_means_while_commands_are_in_force_are_interpolated_from_measurements(ti
 
 
 def test_the_continuous_residual_is_recovered_from_the_states_at_instants() -> None:
-    """The disturbance is a wave, and the mirror holds its shape; the residual at the instants alone is smaller."""
+    """The disturbance is a sinusoid, and the mirror holds its shape; the residual at the instants alone is smaller."""
     timing, law, k, omega = Timing.of(1, 0.0), integrator_of_tip(0.5, 1), np.arange(3000), 0.3
-    wave = np.sqrt(2) * np.cos(omega * k + 1)
-    mirror, c = np.zeros_like(wave), 0.0
+    sinusoid = np.sqrt(2) * np.cos(omega * k + 1)
+    mirror, c = np.zeros_like(sinusoid), 0.0
     for frame in range(len(k)):
         mirror[frame] = c
-        c -= 0.5 * (wave[frame] + c)
-    residual_nm2 = continuous_residual_nm2(wave[:, None], mirror[:, None])[500:-100]
+        c -= 0.5 * (sinusoid[frame] + c)
+    residual_nm2 = continuous_residual_nm2(sinusoid[:, None], mirror[:, None])[500:-100]
     assert np.isfinite(residual_nm2).all()
     assert residual_nm2.mean() == pytest.approx(residual_power(law, np.array([omega]), timing)[0, 0], rel=0.01)
-    assert np.mean((wave + mirror)[500:-100] ** 2) < 0.8 * residual_nm2.mean()
-    earlier = continuous_residual_nm2(wave[:, None], mirror[:, None], 0.5)[500:-100].mean()
+    assert np.mean((sinusoid + mirror)[500:-100] ** 2) < 0.8 * residual_nm2.mean()
+    earlier = continuous_residual_nm2(sinusoid[:, None], mirror[:, None], 0.5)[500:-100].mean()
     assert earlier == pytest.approx(residual_power(law, np.array([omega]), Timing(1, 0.5, 0.0))[0, 0], rel=0.01)
     assert Timing.measured(1.0, 0.5, 0.6) == Timing.of(1.0, 0.5)  # 1.1 periods are too late for a delay of one
 
 
 def test_the_held_residual_is_recovered_from_noisy_measurements() -> None:
-    """A wave with 1 nm of white noise: the residual of the means agrees with theory."""
+    """A sinusoid with 1 nm of white noise: the residual of the means over each command's period agrees with theory."""
     timing, law, rng = Timing(1, 1, 0.5), integrator_of_tip(0.3, 1), np.random.default_rng(3)
     k, omega, frames = np.arange(20_000), 0.2, 20_000
-    wave = 2 * np.sqrt(2) * np.exp(1j * (omega * k + 1))
-    measured = (wave * mean_over(np.array([omega]), 0.5)).real + rng.standard_normal(frames)
+    sinusoid = 2 * np.sqrt(2) * np.exp(1j * (omega * k + 1))
+    measured = (sinusoid * mean_over(np.array([omega]), 0.5)).real + rng.standard_normal(frames)
     c, x = np.zeros(frames), 0.0
     for frame in range(frames):
         c[frame] = x = x - 0.3 * (measured[frame] + x)

@@ -11,7 +11,7 @@ from lowfc.adapters.files import factory
 from lowfc.adapters.files.whole_file import require_folder
 from lowfc.arrays import Array, single
 from lowfc.client import Client, configuration_of
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, raised_as
 from lowfc.control.calibration.alignment import Alignment, Geometry, align, onto
@@ -113,7 +113,7 @@ def on_sensor(config: Configuration, computed: Calibration, geometry: Geometry, 
             camera=in_use.camera,
         )
         R = compute_reconstructor(config, calibration, None, estimator=config.control.estimator).matrix
-    return identified(replace(calibration, reconstructor=single(R)))
+    return with_identity(replace(calibration, reconstructor=single(R)))
 
 
 def oriented(

@@ -9,7 +9,7 @@ import numpy as np
 
 from lowfc.adapters.files import calibration_file, factory
 from lowfc.arrays import Array, single
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, raised_as
 from lowfc.control.calibration.adapted import on_pixels
@@ -162,7 +162,7 @@ def measured_calibration(
     )
     actuators = single(_actuators_to_modes(config, in_use, reconstruction.matrix, measured.response))
     calibration = replace(calibration, reconstructor=single(reconstruction.matrix), actuators_to_modes=actuators)
-    return identified(calibration), reconstruction
+    return with_identity(calibration), reconstruction
 
 
 def computed_noise_nm(config: Configuration, calibration: Calibration, computed: Calibration) -> Array | None:

@@ -16,7 +16,7 @@ from lowfc.adapters.process.progress import percentage_bar
 from lowfc.adapters.process.terminal import configuration
 from lowfc.arrays import Array, single
 from lowfc.client import Client, configuration_of
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError, raised_as
 from lowfc.control.calibration.adapted import with_dark, with_reference
@@ -211,7 +211,7 @@ def _in_use(loop: Client) -> Iterator[tuple[Calibration, tuple[float, float]]]:
 
 def write(calibration: Calibration, out: Path, loop: Client | None) -> Calibration:
     """Write a calibration with its identity; load it into the loop, if there is one."""
-    calibration = identified(calibration)
+    calibration = with_identity(calibration)
     calibration_file.save(calibration, out)
     if loop is not None:
         loop.load(calibration)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from lowfc.arrays import Array, single
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
 from lowfc.control.calibration import poke_plan
@@ -97,7 +97,7 @@ def aligned_calibration(
         "poke_correlation": poke_correlation,
     }
     calibration = replace(calibration, reference=in_use.reference, estimator=f"{calibration.estimator}{FIRST_SUFFIX}")
-    return identified(calibration)
+    return with_identity(calibration)
 
 
 def poked_calibration(player: Player, config: Configuration, delay: Delay) -> Calibration:
@@ -112,7 +112,7 @@ def poked_calibration(player: Player, config: Configuration, delay: Delay) -> Ca
     calibration = replace(in_use, response=single(response), estimator=f"{config.control.estimator}+poke{FIRST_SUFFIX}")
     matrix = compute_reconstructor(config, calibration, None).matrix
     player.report(f"{CYCLES} pokes of each mode by {amplitude_nm:.3g} nm")
-    return identified(replace(calibration, reconstructor=single(matrix)))
+    return with_identity(replace(calibration, reconstructor=single(matrix)))
 
 
 def linear_amplitude_nm(player: Player, config: Configuration, delay: Delay, default_nm: float) -> float:

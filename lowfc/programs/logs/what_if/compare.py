@@ -9,7 +9,7 @@ from lowfc.adapters.files.factory import contrast_or_none, detector, equivalent_
 from lowfc.adapters.logs.columns import count_reasons
 from lowfc.adapters.logs.recovery import missing_end_text
 from lowfc.arrays import Array, Mask, Single
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.contract.errors import CalibrationError, ConfigurationError, raised_as
 from lowfc.contract.messages import MIRROR_STATE
 from lowfc.control.calibration.calibration import ESTIMATORS, Calibration, reconstructor
@@ -218,7 +218,7 @@ def _reconstructed(calibration: Calibration, estimator: str, run: LoggedRun) -> 
             equivalent_read_noise_e(camera),
             estimator,
         )
-    return identified(replace(calibration, reconstructor=R.astype(np.float32), estimator=estimator))
+    return with_identity(replace(calibration, reconstructor=R.astype(np.float32), estimator=estimator))
 
 
 def _in_other_modes(logged: Calibration, other: Calibration, command_nm: Single) -> Single:

@@ -12,7 +12,7 @@ import numpy as np
 from lowfc.adapters.files import calibration_file
 from lowfc.adapters.files.factory import settings
 from lowfc.client import Client
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.contract.configuration import FIXED_GAINS
 from lowfc.contract.errors import RequestRefusedError
 from lowfc.contract.messages import Role
@@ -72,7 +72,7 @@ def _load_and_close(bench: ChaosBench, calibration: Calibration) -> None:
 def _reversed_calibration(bench: ChaosBench) -> None:
     client, good = bench.client(), _calibration(bench)
     client.open_loop()
-    _load_and_close(bench, identified(replace(good, reconstructor=-good.reconstructor)))
+    _load_and_close(bench, with_identity(replace(good, reconstructor=-good.reconstructor)))
     bench.await_steps(HOLD_FRAMES)
     client.safe()
     bench.await_steps(HOLD_FRAMES)
@@ -99,7 +99,7 @@ def _foreign_calibration(bench: ChaosBench) -> None:
         dark=good.dark[cropped],
     )
     client.open_loop()
-    client.load(identified(foreign))
+    client.load(with_identity(foreign))
     bench.await_steps(HOLD_FRAMES)
     _load_and_close(bench, good)
 

@@ -26,7 +26,7 @@ REQUESTS = 25
 _POLL_S = 0.01
 _NAMES = ("status", "open", "close", "gain", "leak", "limit", "offset", "channel", "play", "load", "law", "nonsense")
 _MAY_SUCCEED = ("status", "open", "close", "offset", "play", "law", "channel")
-"""Requests that random bytes may encode by chance: in their place, a name that does not exist is used."""
+"""Requests that random bytes may form validly: in their place, a name that does not exist is used."""
 
 
 class Intruder(AbstractContextManager["Intruder"]):
@@ -49,7 +49,7 @@ class Intruder(AbstractContextManager["Intruder"]):
         self._bus.close()
 
     def send(self, topic: Topic, payload: bytes) -> None:
-        """Publish a message whose sequence has the start time `FORGED_S`."""
+        """Publish a message whose sequence claims a publisher that started at `FORGED_S`."""
         self._publishers[topic].put(payload, self._clock.host_ns(), sequence_of(FORGED_S, self._counts[topic]))
         self._counts[topic] += 1
 
@@ -58,7 +58,7 @@ class Intruder(AbstractContextManager["Intruder"]):
         return len(self._bus.get(REQUEST_KEY.format(name=name), payload, timeout_s))
 
 
-@case("junk", "random bytes on every topic, 2,000 a second", allowed=LOST, prints_tracebacks=True)
+@case("junk", "2,000 messages of random bytes a second, over all topics", allowed=LOST, prints_tracebacks=True)
 def _flood(bench: ChaosBench) -> None:
     with Intruder(bench) as intruder:
         begun_s = time.monotonic()
