@@ -71,7 +71,7 @@ def step_times(size: Size, seconds: float) -> Result:
 
 
 def timed(work: Callable[[], object], seconds: float) -> dict[str, float]:
-    """p50, p99 and mean processor time (cpu) of a call of `work`, us, which is repeated for `seconds`."""
+    """p50, p99 and mean processor time (cpu), us, of a call of `work`; the call is repeated for `seconds`."""
     work()
     durations_ns = []
     end_ns = time.perf_counter_ns() + round(seconds * 1e9)

@@ -1,7 +1,7 @@
 """Layouts for rerun, in deploy/layouts: for a log opened directly in rerun, and for the drawings of `lowfc view`.
 
 Rerun decodes every message into one struct; a mapping selects a field of it. Rerun applies a layout to data with the
-same application id, which for a log is the name of its file: `rerun rrd route` writes that id into the layout.
+layout's application id. That of a log is its file name without suffix; `rerun rrd route` writes it into the layout.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""The loop of the comparison in plain Python and zenoh: processes with the arguments in `benchmarks.peers.shared`.
+"""The control loop in plain Python and zenoh, compared with lowfc's; for the arguments see `benchmarks.peers.shared`.
 
 The source is also the mirror: it records when each command arrives.
 """

@@ -22,8 +22,8 @@ class MirrorWatch:
     Attributes:
         applied: frame sequences of the last applied commands, each with the time of the mirror's report, ns of the
             host's clock.
-        interruption: clause on the last event since construction that ends a probe sequence: a mirror did not follow
-            commands, received none because frames stopped, or restarted; empty without one.
+        interruption: for an error message, the last event since construction that makes a probe sequence invalid: a
+            mirror did not follow commands, received none because frames stopped, or restarted; empty without one.
         offset: offset of the router's clock from this host's; None on one host.
     """
 

@@ -14,7 +14,7 @@ KEYS = {
     "realtime.stay_awake": "realtime.disable_cpu_idle",
     "realtime.rehearse": "realtime.cache_warmup",
 }
-"""Current names of configuration keys, by their names until version 0.1."""
+"""Current names of configuration keys, by their names in version 0.1 and before."""
 
 FIELDS = {
     **{
@@ -38,10 +38,10 @@ FIELDS = {
     "Health.granted": "realtime_granted",
     "Health.refused": "realtime_refused",
 }
-"""Current names of message fields, by their names until version 0.1; numbers, types and labels never change."""
+"""Current names of message fields, by their names in version 0.1 and before; numbers, types and labels never change."""
 
 VALUES = {"LOOP_MODE_SAFED": "LOOP_MODE_SAFE"}
-"""Current names of enumeration values, by their names until version 0.1."""
+"""Current names of enumeration values, by their names in version 0.1 and before."""
 
 LAW_EXTENSIONS = {
     "TRANSITION": "FOLLOW",

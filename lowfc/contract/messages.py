@@ -124,7 +124,7 @@ CONTROL_INPUT = Topic(
     wire.ControlInput,
     Rate.EVENT,
     _CONTROLLER,
-    "Inputs of the controller other than frames and requests, with all values that depend on its clock.",
+    "Inputs of the controller other than frames and requests, with all that it reads from its clock.",
 )
 TIMING = Topic(
     "lowfc/control/timing",
@@ -193,7 +193,7 @@ LAW = Topic(
     wire.LinearLaw,
     Rate.EVENT,
     _CONTROLLER,
-    "A requested control law, with its matrices; the controller's states have the identity of the one in use.",
+    "A requested control law, with its matrices; the controller's states name the one in use by its identity.",
     queryable=True,
 )
 PLAY = Topic(
@@ -201,7 +201,7 @@ PLAY = Topic(
     wire.Play,
     Rate.EVENT,
     _CONTROLLER,
-    "Table of a requested probe sequence; the controller's states have the identity of the current one.",
+    "Table of a requested probe sequence; the controller's states name the current one by its identity.",
     queryable=True,
 )
 CALIBRATION = Topic(
@@ -209,8 +209,8 @@ CALIBRATION = Topic(
     wire.Calibration,
     Rate.EVENT,
     _CONTROLLER,
-    "A requested calibration: matrices from a frame to modes, and from modes to actuators; the controller's states "
-    "have the identity of the one in use.",
+    "A calibration loaded at the start or by request: matrices from a frame to modes, and from modes to actuators; the "
+    "controller's states name the one in use by its identity.",
     queryable=True,
 )
 BENCH = Topic(
@@ -337,7 +337,7 @@ def floats(data: bytes, *shape: int) -> Single:
 
 
 def fields_of(source: object, names: Iterable[str]) -> dict[str, Any]:
-    """Attributes of `source`, a value or a message, by name; the fields `names` are called alike in both."""
+    """Attributes `names` of `source`, a value or its message, which use the same names."""
     return {name: getattr(source, name) for name in names}
 
 

@@ -5,7 +5,7 @@ LEAD_NS = 300_000
 MIN_LEAD_NS = 80_000
 """Least time from a warm-up to the next frame: a later warm-up would delay that frame."""
 MIN_PERIOD_NS = 500_000
-"""Longest frame period without warm-ups: there is no time for one, and no need, since the caches stay warm."""
+"""Up to this frame period there are no warm-ups: there is no time, and no need, since the caches stay warm."""
 LATENESS_DIVISOR = 50
 """A frame that is late by at most `LEAD_NS` moves the schedule by its lateness divided by this number."""
 

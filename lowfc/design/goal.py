@@ -35,7 +35,7 @@ class Goal:
             "contrast": contrast added to the dark zone by the noise of 14 modes in one exposure of Table 4's star.
         estimator: "pinv", or "weighted", whose noise is the Cramer-Rao bound.
         modes: Number of modes in "table3", "pareto" and "condition".
-        weight: The weight, 0 to 1, in the merits "paper" and "pareto"; None for 1/2.
+        weight: The weight, 0 to 1: in "paper" that of Table 3, in "pareto" that of Table 4; None for 1/2.
     """
 
     merit: str = "paper"
@@ -103,7 +103,7 @@ def _tilt_mas(candidate: Candidate, estimator: str) -> float:
 
 
 def predictions(candidate: Candidate) -> dict[str, Any]:
-    """Predicted values of the first row of Table 3 and of Table 4, as plain numbers for printing and for JSON.
+    """Predicted values of Tables 3 (the first of `paper_rows`) and 4, throughput, condition, noise and contrast.
 
     "bound" is the Cramer-Rao bound of Table 3, without second-order errors; in Table 4 "weighted" attains the bound.
     """

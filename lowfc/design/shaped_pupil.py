@@ -2,7 +2,7 @@
 
 The variables are the transmissions of the cells of one quadrant. A mask that is symmetric about both axes has a real
 field, so that `|E| <= sqrt(contrast) E(0)` is two linear inequalities at every point. Less symmetry would gain nothing:
-the mean of any mask and its mirror images is as open, and as dark in a zone with the same symmetries.
+the mean of any mask and its mirror images is as open as the mask, and as dark if the zone is symmetric, too.
 
 Between the points of a coarse grid the intensity is tens of times higher than at the points. `exchange` therefore adds
 the maxima of the solution on a fine grid as points to the next program, until none exceeds the required contrast.
@@ -103,8 +103,8 @@ class Round:
         points: Number of points in the program, each with one sign of the field.
         quarter: (cells, cells) quadrant of the mask, [0, 0] next to the pupil's centre.
         open_area: Open fraction of the circle.
-        bound: Dual bound on `open_area`: no mask with `limit` times the contrast at these points is more open. A mask
-            with the contrast itself may be.
+        bound: Dual bound on `open_area`: no mask that meets `limit` times the contrast at these points is more open. A
+            mask that meets only the contrast itself may be.
         contrast: Largest contrast in the zone on the fine grid; infinite for a closed mask.
     """
 
@@ -168,7 +168,9 @@ def exchange(request: Request) -> Iterator[Round]:
             maxima, maxima_signs = _maxima(quarter, request, level * (1 + 1e-6))
             points, signs = np.concatenate([points, maxima]), np.concatenate([signs, maxima_signs])
             multipliers = np.concatenate([multipliers, np.zeros(len(maxima))])
-        if is_open:  # drop the limits on the sign that the field lacks at a point: with more cells they hardly ever act
+        if (
+            is_open
+        ):  # drop each point's limit for the opposite sign of the field, which hardly ever acts with more cells
             relevant = (signs * _field_at(quarter, points) > 0) | (multipliers > 0)
             points, signs, multipliers = points[relevant], signs[relevant], multipliers[relevant]
 
@@ -221,12 +223,12 @@ def in_shortest_type(quarter: Array, request: Request) -> NDArray[np.floating]:
 
 
 def nearest_feasible(request: Request) -> tuple[float | None, float | None]:
-    """For an infeasible request, the nearest feasible inner angle (steps of 0.1) and contrast (steps of 26 %).
+    """For an infeasible request, the nearest feasible inner radius (steps of 0.1) and contrast (steps of 26 %).
 
     They are found with the fewest cells that resolve the zone.
 
     Returns:
-        Inner angle, lambda/D (at most twice as large), and contrast (at most 1e5 times as large), each with everything
+        Inner radius, lambda/D (at most twice as large), and contrast (at most 1e5 times as large), each with everything
         else unchanged; None if even the largest value is infeasible.
     """
     coarse = replace(request, cells=_cell_numbers(request)[0])
@@ -282,7 +284,7 @@ def _rows(points: Array, signs: Array, cells: int, symmetry: str) -> Array:
 
 
 def _waves(axis: Array, cells: int) -> Array:
-    """Kernel (n, cells) from a mirrored half-axis of cells to the image, averaged over each cell's samples."""
+    """Cosine kernel (n, cells) from the cells of half an axis of a symmetric pupil to the image; means over cells."""
     u = pupil_axis(SAMPLES)[SAMPLES // 2 :]
     return np.asarray(np.cos(2.0 * np.pi * np.outer(axis, u)).reshape(axis.size, cells, -1).mean(axis=2))
 

@@ -407,7 +407,7 @@ def test_the_configuration_is_queried_until_it_is_known(run: LiveRun, monkeypatc
     assert console_feed._config == CONFIG
 
 
-def test_states_are_queried_from_a_new_process_and_every_five_seconds_from_a_controller_without_states(
+def test_states_are_queried_when_a_process_appears_and_every_five_seconds_until_the_controllers_are_received(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(monitor.Monitor, "_query", query := Mock())

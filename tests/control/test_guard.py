@@ -126,12 +126,12 @@ def test_the_waiting_time_doubles_until_a_takeover_is_final() -> None:
             group, why = group.judged((10.0, 5.0, 100.0), SPANS, void=False)
         assert group.overruled
         assert "leaves 3.16 nm rms, the integrator would leave 2.24" in why
-        for blocks in range(1, 10 * SPANS.better):
+        for blocks in range(1, 10 * SPANS.waiting):
             group, why = group.judged((10.0, 2.0, 100.0), SPANS, void=False)
             if why == LAW_RETURNS:
                 waited.append(blocks)
                 break
-    assert waited == [SPANS.better, 2 * SPANS.better, 4 * SPANS.better]
+    assert waited == [SPANS.waiting, 2 * SPANS.waiting, 4 * SPANS.waiting]
     assert group.overruled
 
 
@@ -144,9 +144,9 @@ def test_a_loop_is_judged_to_amplify_if_its_error_is_large_and_not_due_to_a_larg
     assert (group.overruled, group.final, "without correction" in why) == (final, final, final)
 
 
-@pytest.mark.parametrize(("law_nm2", "void"), [(3.0, False), (2.0, True)], ids=["not better", "void"])
+@pytest.mark.parametrize(("law_nm2", "void"), [(3.0, False), (2.0, True)], ids=["not better", "comparison void"])
 def test_one_block_in_which_the_law_is_not_better_restarts_the_waiting_time(law_nm2: float, void: bool) -> None:
-    group = Group(overruled=True, takeovers=1, blocks=SPANS.better - 1, usual_nm2=100.0)
+    group = Group(overruled=True, takeovers=1, blocks=SPANS.waiting - 1, usual_nm2=100.0)
     group, _ = group.judged((10.0, law_nm2, 100.0), SPANS, void=void)
     assert (group.overruled, group.blocks) == (True, 0)
 
@@ -161,12 +161,12 @@ def test_the_law_returns_once_it_would_be_far_better() -> None:
     assert overruled(state) == [True, False]
     noisy = replace(state.loop.integrator, gain=np.array([1.9, 1.9, 0.3], np.float32))
     state = state._replace(loop=state.loop._replace(integrator=noisy))
-    quiet = np.zeros(((spans.better + 3) * spans.block, len(NOLL)))
+    quiet = np.zeros(((spans.waiting + 3) * spans.block, len(NOLL)))
     steps, _, state = run_toy(setup, quiet, NOISE_NM[: len(quiet)], state, frames + 1)
     assert [group.takeovers for group in state.loop.law_runner.guard.groups] == [1, 0]
     assert state.loop.law_runner.alone()
     overruled_steps = [step.reasons for step in steps].count((Limit.LAW_OVERRULED,))
-    assert spans.better * spans.block <= overruled_steps < len(steps)
+    assert spans.waiting * spans.block <= overruled_steps < len(steps)
 
 
 def test_closing_the_loop_and_loading_a_law_reset_the_guard() -> None:
@@ -189,7 +189,7 @@ def test_missing_and_refused_frames_hold_the_virtual_command() -> None:
     assert np.abs(guarded.loop.history_nm[0] - unguarded.loop.history_nm[0]).max() > 1
 
 
-def test_a_virtual_law_has_the_command_of_a_law_that_drives_the_mirror() -> None:
+def test_a_law_that_is_only_computed_has_the_command_of_a_law_that_drives_the_mirror() -> None:
     frames = BEFORE + (WORSE_BLOCKS + 3) * SPANS.block
     _, state = run(with_law(BAD_TILT), frames)
     setup = replace(SETUP, guard=False)
@@ -215,7 +215,7 @@ def test_probe_sequences_resets_and_limits_suspend_the_comparison() -> None:
 
 
 def test_a_decoded_guard_continues_identically() -> None:
-    """It is decoded in each phase: while it compares, in the cross-fade, and while an overruled law is virtual."""
+    """It is decoded in each phase: while it compares, in the cross-fade, and while the integrator drives."""
     state, frames_done = with_law(BAD_TILT), 0
     for until in (
         BEFORE + 150,

@@ -146,8 +146,8 @@ def test_infeasible_request_reports_the_nearest_feasible_one(tmp_path):
     path = tmp_path / "spc.npz"
     arguments = ["spc", "--inner", "2.5", "--outer", "5", "--cells", "16", "--out", str(path)]
     error = refusal("design", *arguments, kind=ConfigurationError)
-    assert "inner angle 2.5 lambda/D at contrast 1e-09 is infeasible" in error
-    nearest = r"nearest feasible inner angle is (\S+) \(same contrast\), or contrast is (\S+) \(same angle\)"
+    assert "inner radius 2.5 lambda/D at contrast 1e-09 is infeasible" in error
+    nearest = r"nearest feasible inner radius is (\S+) \(same contrast\), or contrast is (\S+) \(same radius\)"
     inner, contrast = map(float, re.search(nearest, error).groups())
     request = replace(SMALL, inner=2.5, outer=5.0)
     assert is_feasible(replace(request, inner=inner))

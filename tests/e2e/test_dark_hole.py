@@ -24,7 +24,10 @@ def flat_nm() -> Array:
 
 @pytest.fixture(scope="module")
 def dark_hole_run(tmp_path_factory: pytest.TempPathFactory) -> DarkHoleRun:
-    """Steps of a dark hole with the zero point shifted, then without; the mirror has a flat map and dead actuators."""
+    """Dark-hole steps on a channel that shifts the zero point, then on one that does not.
+
+    The mirror has a flat map and dead actuators.
+    """
     folder = tmp_path_factory.mktemp("dark_hole")
     active = np.ones(GRID)
     active.flat[list(DEAD)] = 0

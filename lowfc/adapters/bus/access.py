@@ -14,7 +14,7 @@ from lowfc.contract.messages import COMMAND, HEALTH, RECORD_KEY, REQUEST_KEY, TO
 ROUTER = "router"
 """Role of the router itself: its common name, and its name in Health."""
 CLOCK_KEY = "lowfc/clock"
-"""Key of the queryable that answers with the router's time, which envelopes carry in a run on several hosts."""
+"""Key of the queryable that answers with the router's time, with which envelopes are stamped on several hosts."""
 
 _LOCAL = frozenset({Role.LAUNCHER, Role.REPLAY})  # never part of a run on several hosts
 
@@ -24,8 +24,8 @@ class Grant:
     """Rights of a role, as lists of keys.
 
     `subscribed` are the role's keys to which other processes may subscribe, `queried` those that they may query. A role
-    publishes Health under its own name only; a mirror publishes, answers and receives commands under its name only. All
-    other keys have "*" in place of a name.
+    publishes Health under its own name only; a mirror publishes, answers queries and receives commands only under its
+    own name. All other keys have "*" in place of a name.
     """
 
     role: str

@@ -37,7 +37,7 @@ class DirectWriter:
         self._retry_s = 0.0
 
     def send(self, envelope: bytes, payload: bytes) -> bool:
-        """Send a message and return whether it was sent; a reader too far behind loses the message, as on the bus."""
+        """Send a message and return whether it was sent; a reader too far behind does not receive it."""
         if self._socket is None:
             self._connect()
             if self._socket is None:
@@ -100,7 +100,7 @@ class DirectReader:
     For a topic with one publisher: once the socket works, a message from the bus is dropped as late unless it is newer
     than all earlier ones. Once a message has arrived on both paths, the reader unsubscribes from the bus, until the
     publisher disconnects from the socket. Messages from the socket are forwarded as they arrive, even if their
-    sequences decrease. While unsubscribed, the reader also forwards a repetition of the newest message.
+    sequences decrease. A message that was new while the reader was unsubscribed is forwarded again if it is repeated.
 
     For a topic with several publishers: the reader stays subscribed to the bus, and a message that only the bus carried
     may be forwarded after a newer one.

@@ -78,7 +78,7 @@ class ZenohPublisher:
             session.declare_queryable(key, Callback(self._answer, indirect=False))
 
     def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
-        """Send `payload`; wait at most 1 ms for a slow reader, which then loses the message; in lockstep, wait on."""
+        """Send `payload`; wait at most 1 ms for a slow reader, which then loses the message; in lockstep, longer."""
         envelope = Envelope(
             sequence_of(self._bus.start_s, self.published) if sequence is None else sequence,
             self._host_ns() if publish_time_ns is None else publish_time_ns,
@@ -148,7 +148,7 @@ class ZenohBus:
         """Join a run.
 
         Args:
-            links: links of the run.
+            links: endpoints and shared secret of the run.
             role: role of this process.
             clock: clock of the run.
             monitor: whether this process is a monitor; set it in a process's first bus. A monitor polls `Ring`s. It
@@ -157,7 +157,8 @@ class ZenohBus:
 
         Raises:
             BusError: the role's port is in use, or the role runs on another host; zenoh opens no session; or the
-                router refuses the certificate, or cannot be reached for a reason other than its absence.
+                router refuses the certificate, or cannot be reached although it runs (an absent one is
+                waited for).
             DataFileError: the run's secret is missing or damaged; across hosts, the role has no valid certificate.
         """
         self.role = role

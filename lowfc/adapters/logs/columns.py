@@ -58,9 +58,9 @@ class Steps:
 class Truths:
     """Truth of a simulation, one row per frame; empty for a log of real devices.
 
-    If `instants` is not 0, rms values are over the whole frame period, as the wavefront changes while the mirror holds
-    its shape. If it is 0 (older logs, and simulations without such rms values), all values are those at the start of
-    the exposure.
+    If `instants` is not 0, rms values are over the whole frame period, in which the wavefront changes while the mirror
+    holds its shape. If it is 0 (older logs, and simulations without such rms values), all values are those at the start
+    of the exposure.
 
     Attributes:
         sequence: sequence of the frame.

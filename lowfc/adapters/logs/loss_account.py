@@ -1,4 +1,7 @@
-"""Account of the messages of a recording: recorded and lost ones, by topic."""
+"""Account of the messages of a recording: recorded and lost ones, by topic.
+
+A start is one run of a publishing process; the sequences of its messages contain the time of the start.
+"""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -25,8 +28,8 @@ class _Tally:
 
     Attributes:
         gaps: gaps in the received sequences.
-        published: number published, by the publisher's own count; 0 until it reports that it has stopped. A message
-            sent twice counts twice.
+        published: number published, or lost by a camera, by the publisher's own count; 0 until it reports that it has
+            stopped. A message sent twice counts twice.
         recorded: number recorded.
         duplicates: number of recorded messages that were duplicates.
         never_sent: frames that a camera lost and never sent, according to its Health, less `lost_before`.
@@ -53,9 +56,10 @@ class _Tally:
 
     @property
     def confirmed(self) -> int:
-        """Number surely lost: `lost`, but no more than at the last `newly_lost` if the camera lost frames itself.
+        """Number certainly lost.
 
-        The newest gap may consist of further frames that the camera never sent; its next Health reports them.
+        If a camera has lost frames itself, it is at most the `lost` of the previous call of `newly_lost`: a newer gap
+        may consist of frames that the camera never sent, which only its next Health reports.
         """
         return min(self.lost, self.last_lost) if self.never_sent else self.lost
 
@@ -97,7 +101,7 @@ class LossAccount:
         self._tallies: dict[tuple[str, str], dict[int, _Tally]] = {}
 
     def enter(self, topic: Topic, sample: Sample, *, recorded: bool, unwanted: bool = False) -> None:
-        """Count a received message; counting begins with the first message of a publisher's start.
+        """Count a received message; counting begins with the first one received from a publisher's start.
 
         A message left out of the log on purpose is `unwanted` and counts as recorded.
         """
@@ -144,7 +148,7 @@ class LossAccount:
         return +self._sum(lambda tally: tally.lost)
 
     def newly_lost(self) -> dict[str, int]:
-        """Messages lost since the last call, by key; a counted one that arrives after all offsets a later loss."""
+        """Messages lost since the last call, by key; one reported as lost that arrives later cancels the next loss."""
         lost = +self._sum(lambda tally: max(0, tally.confirmed - tally.reported))
         for _, tally in self._all():
             tally.reported = max(tally.reported, tally.confirmed)
@@ -172,7 +176,7 @@ class LossAccount:
         return sums
 
     def _author(self, topic: Topic, sample: Sample) -> str:
-        """Publisher of an event, since several processes with equal starts publish events; empty for other topics."""
+        """Publisher of an event, as several publish events and may start in the same second; empty for other topics."""
         if topic is not EVENT:
             return ""
         try:

@@ -1,6 +1,6 @@
-"""Trial of this host's real-time measures and wake-up latency, in a separate process.
+"""Trial, in a separate process, of the real-time settings that this host grants, and of its wake-up latency.
 
-The process ends afterwards, so that no measure stays in force for the caller.
+The process ends afterwards, so that no setting stays in force for the caller.
 """
 
 import os
@@ -22,9 +22,9 @@ class Trial(NamedTuple):
     """Result of a trial.
 
     Attributes:
-        refused: for each refused key (`priority`, `lock_memory`, `huge_pages`, `disable_cpu_idle`) the measure and the
-            cost of its refusal.
-        cpus: processors that the process may use, also beyond the caller's.
+        refused: for each refused setting (`priority`, `lock_memory`, `huge_pages`, `disable_cpu_idle`) its description
+            and the cost of its refusal.
+        cpus: processors that the process may use, including those outside the caller's affinity.
         normal_ns: lateness of each wake-up in the normal scheduling class, ns.
         fifo_ns: lateness of each wake-up under SCHED_FIFO, ns; empty if not requested or refused.
     """
@@ -36,7 +36,7 @@ class Trial(NamedTuple):
 
 
 def try_out(requested: Realtime, cpus: set[int], seconds: float) -> Trial:
-    """Request the measures of a process of the loop, and time 1000 wake-ups per second in each scheduling class.
+    """Request the real-time settings of a loop process, and time 1000 wake-ups per second in each scheduling class.
 
     The trial runs on `cpus`, or on the caller's processors if none of `cpus` can be used. OSError if the trial's
     process cannot start, or fails.
@@ -53,7 +53,7 @@ def try_out(requested: Realtime, cpus: set[int], seconds: float) -> Trial:
 def lateness_ns(wake_ups: int) -> list[int]:
     """Sleep until times a period of `RATE_HZ` apart; return the lateness of each wake-up, ns.
 
-    The times are fixed beforehand: one that passes during a late wake-up also counts as late.
+    The times are fixed beforehand: a time that passes while an earlier wake-up is late also counts as late.
     """
     late_ns = [0] * wake_ups
     due_ns = time.monotonic_ns()

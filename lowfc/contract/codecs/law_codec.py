@@ -74,7 +74,7 @@ def wire_play(table: PlayTable, time_ns: int) -> wire.Play:
 
 
 def put_command_channels(message: wire.ControllerState, command_channels: CommandChannels) -> None:
-    """Write offset, command channels and probe sequence into a state."""
+    """Write offset, shifts of the zero point, command channels and probe sequence into a state."""
     message.offset_nm.extend(command_channels.offset_nm.tolist())
     message.shift_history_nm.extend(np.concatenate(command_channels.shifts_nm).tolist())
     for channel in command_channels.channels:

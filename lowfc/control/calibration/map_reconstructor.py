@@ -11,9 +11,10 @@ from lowfc.control.loop.camera import CameraSettings
 
 @lru_cache(maxsize=2)  # automatic gains need the same covariance when they are chosen, requested and applied
 def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: CameraSettings | None) -> Array | None:
-    """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront rms, after division by the frame's flux.
+    """Covariance (modes, modes), nm^2, of the modes' noise in one frame, which is divided by its flux.
 
-    It includes photon noise of I0 and read noise. None if the camera's gain or the flux is unknown. Read-only.
+    It includes the photon noise of a frame whose image is I0, and read noise. None if the camera's gain or the flux is
+    unknown. Read-only.
     """
     if camera is None or not camera.gain_e_per_dn > 0 or not flux_dn > 0:
         return None
@@ -38,12 +39,12 @@ def map_rows(
 
     M_u are the rows of the uncorrected modes u; they stay as they are. P_u is the prior of these modes, and C the noise
     covariance of the calibration's own R. If this R is the weighted one for the same flux, the new rows of R are
-    (H'WH + P^-1)^-1 H'W.
+    (H'WH + P^-1)^-1 H'W, with W the pixels' inverse variances, and P^-1 = 0 for the corrected modes.
 
     Args:
         calibration: The calibration in use.
         prior_nm2: (modes,) mean square of an uncorrected mode; 0 for a corrected mode.
-        flux_dn: Sum of the good pixels, DN, from which C is computed.
+        flux_dn: Sum of the good pixels, DN, from which C is computed; if not above 0, the matrices are unchanged.
         camera: Camera settings; if they or their gain are unknown, or no mode or every mode is corrected, the matrices
             are returned unchanged.
         matrices: The matrices M.

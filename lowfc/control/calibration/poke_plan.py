@@ -57,7 +57,7 @@ def cycle(patterns: Array, hold: int, settle: int, rest: int, *, backwards: bool
         backwards: Reverse the order of the patterns; with every other cycle backwards, slow drifts average out.
 
     Raises:
-        ValueError: no frame would be used.
+        ValueError: `hold` is below 1, or `settle` or `rest` below 0.
     """
     if hold < 1 or settle < 0 or rest < 0:
         raise ValueError(f"hold must be 1 frame or more, settle and rest 0 or more; got {hold}, {settle} and {rest}")
@@ -115,7 +115,7 @@ def seen_rows(table: Array, weights: Array, sequence: npt.NDArray[np.integer], c
 
 
 def usable_exposures(plan: Plan, sequence: npt.NDArray[np.integer], commanded: Mask, lag: int) -> Mask:
-    """Whether each exposure (exposures,) sees a usable row, with no command missing since the frame before this row.
+    """Whether each exposure (exposures,) sees a usable row, and every frame from the one before led to a command.
 
     Args:
         plan: The plan that was played.

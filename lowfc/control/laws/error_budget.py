@@ -72,7 +72,7 @@ def sensor_noise(
 
 def white_noise(law: LinearLaw, noise_nm: Array, timing: Timing) -> Term:
     """Residual from noise of the modes (modes,) that is independent from frame to frame, averaged as in `lag`."""
-    return Term(noise_nm**2 * noise_gain(law, held=timing.held > 0))
+    return Term(noise_nm**2 * noise_gain(law, continuous=timing.held > 0))
 
 
 def lag(law: LinearLaw, disturbance: Spectrum, mean_nm: Array, timing: Timing) -> Term:

@@ -26,7 +26,7 @@ _GRID = 2048  # frequencies of each regular grid
 _AROUND_POLE = np.concatenate([-np.geomspace(1e-2, 1e2, 33)[::-1], [0.0], np.geomspace(1e-2, 1e2, 33)])
 """Frequencies relative to a pole's, in units of the pole's distance from the unit circle."""
 _LOWEST = 1e-6  # rad per frame: an integrator has no value at 0 Hz
-_ROUNDING = 1e-6  # excess above 1 that single precision may cause in poles, except in a driven closed loop
+_ROUNDING = 1e-6  # excess of poles above 1 allowed for single precision, but not in a driven closed loop
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,8 @@ class Margins:
         radius: largest modulus of the closed-loop poles of the mode (and of the modes coupled with it).
         gain_margin: factor by which the loop's gain may grow; infinite if there is no bound.
         gain_reduction: factor above which the gain must stay; 0 if there is no bound.
-        phase_margin_deg: additional phase lag at which the loop oscillates; 180 if the loop never has a gain of 1.
+        phase_margin_deg: least change of phase, lag or lead, at which the loop oscillates; 180 if the loop never has a
+            gain of 1.
         peak: largest `|S|`, the inverse of the modulus margin (the least distance of L from -1).
     """
 
@@ -145,11 +146,11 @@ def noise_transfer(law: LinearLaw, frequency_hz: Array, delay_frames: float | No
     return np.abs(sensitivity(law, 2 * np.pi * np.asarray(frequency_hz, float) / law.rate_hz, delay_frames) - 1)
 
 
-def noise_gain(law: LinearLaw, delay_frames: float | None = None, *, held: bool = False) -> Array:
+def noise_gain(law: LinearLaw, delay_frames: float | None = None, *, continuous: bool = False) -> Array:
     """Residual variance (modes,) caused by white measurement noise, divided by the variance of that noise in one frame.
 
-    The residual is averaged over exposures, which see a mean of two commands if the delay is fractional; with `held`,
-    it is averaged over all time.
+    The residual is its mean over each exposure, which sees a mean of two commands if the delay is fractional. With
+    `continuous`, it is the residual at all times, while the mirror holds each command for a period.
     """
     gain, weights = np.zeros(len(law.noll)), _weights(law, delay_frames)
     for part in _parts(law):
@@ -157,7 +158,7 @@ def noise_gain(law: LinearLaw, delay_frames: float | None = None, *, held: bool 
             continue
         omega = _frequencies(_poles(part.closed(weights)))
         S = part.sensitivity(omega, weights)
-        seen = np.polynomial.polynomial.polyval(np.exp(-1j * omega), weights) if held else 1.0
+        seen = np.polynomial.polynomial.polyval(np.exp(-1j * omega), weights) if continuous else 1.0
         for place, mode in enumerate(part.modes.tolist()):
             gain[mode] = np.trapezoid(np.abs((S[:, place, place] - 1) / seen) ** 2, omega) / np.pi
     return gain
@@ -188,7 +189,7 @@ class _Part:
     A: Array
     K: Array
     own_weights: Array
-    """Weights of the law's own delay, used in y; empty if y is the error."""
+    """Weights of the law's own delay, used in its measurement y; empty if y is the error."""
 
     @property
     def driven(self) -> bool:
@@ -245,7 +246,7 @@ def _parts(law: LinearLaw) -> list[_Part]:
 
 
 def _first_linked(linked: Mask) -> Integers:
-    """First member (n,) of each node's connected group, from links (n, n); the import of scipy.sparse takes 0.3 s."""
+    """First member (n,) of each node's connected group, from links (n, n); importing scipy's takes 0.3 s."""
     while True:
         further = linked.astype(np.float32) @ linked.astype(np.float32) > 0
         if (further == linked).all():

@@ -1,8 +1,8 @@
 """Rejection and noise transfer functions of a loop measured with a multisine, and their departure from theory.
 
-With u added to the loop's input (u = -offset), the measured error is S (disturbance + noise + u). So S = error / u at
-the lines, and T = 1 - S. Everything else appears as S (disturbance + noise), so that the relative error of a line does
-not depend on the rejection at its frequency.
+With u, a multisine whose frequencies are called lines, added to the loop's input (u = -offset), the measured error is
+S (disturbance + noise + u). So S = error / u at the lines, and T = 1 - S. Everything else appears as S (disturbance +
+noise), so that the relative error of a line does not depend on the rejection at its frequency.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from lowfc.arrays import Array, Complex, Integers, Mask
 
 _FAINTEST = 1e-3  # amplitude of a line, relative to the mode's highest; fainter lines are rounding errors
 _ADJACENT = np.array([*range(-16, -1), *range(2, 17)])  # bins, relative to a line's, from which its noise is measured
-_BIN_TO_FLANK = 12 / 7  # ratio of white noise powers under Hann's window: of a bin to that of `flanks`
+_BIN_TO_FLANK = 12 / 7  # power of white noise in a bin over that in `flanks`, under Hann's window
 _DB = 20 / np.log(10)
 
 SIGMAS = 3.5
@@ -101,7 +101,7 @@ def measure_lines(error_nm: Array, added_nm: Array) -> Lines:
     return Lines(modes, bins / frames, S, error)
 
 
-def seen_of_mirror(played_nm: Array, weights: Array) -> Array:
+def modes_seen(played_nm: Array, weights: Array) -> Array:
     """Modes that each exposure sees while `played_nm` is repeated on the mirror, both (frames, modes)."""
     seen = np.zeros_like(played_nm)
     for lag, weight in enumerate(weights):

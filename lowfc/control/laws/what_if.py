@@ -53,7 +53,7 @@ def has_new_exposure(reasons: Long) -> Mask:
 
 
 def missing_before(sequence: Sequences) -> Integers:
-    """Number of exposures without a step (steps,) before each step; `sequence` (steps,) falls only after a clear."""
+    """Number (steps,) of exposures without a step before each step; `sequence` (steps,) ascends but after `clear`."""
     same_start = sequence[1:] >> np.uint64(COUNT_BITS) == sequence[:-1] >> np.uint64(COUNT_BITS)
     follows = same_start & (sequence[1:] > sequence[:-1])
     between = np.where(follows, sequence[1:] - sequence[:-1] - np.uint64(1), np.uint64(0))
@@ -82,10 +82,10 @@ def seen_nm(weights: Single, command_nm: Single, missing: Integers, first_nm: Si
 
 
 def counterfactual(controller: Controller, weights: Single, pol_nm: Single, missing: Integers) -> tuple[Single, Single]:
-    """Fold a controller over a disturbance, from a flat mirror; return its errors and commands (steps, modes).
+    """Run a controller on a disturbance, from a flat mirror; return its errors and commands (steps, modes).
 
     Args:
-        controller: the controller to fold; it is not called for refused frames, which hold the command.
+        controller: the controller; it is not called for refused frames, which hold the command.
         weights: from `lowfc.control.laws.stability.delay_weights`.
         pol_nm: (steps, modes) disturbance and measurement noise; NaN for refused frames, whose error is then NaN too.
         missing: (steps,) from `missing_before`.

@@ -41,7 +41,7 @@ class Estimator(NamedTuple):
         return cls(rows, reference_nm, dark, scratch=aligned(dark), kernel=kernel, tables=tables)
 
     def estimate(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
-        """Estimate of a frame (pixels,) by the reference step; None if its flux is at most `min_flux_dn`."""
+        """Estimate of a frame (pixels,) by the numpy step; None if its flux is at most `min_flux_dn`."""
         np.copyto(self.scratch, pixels)  # a copy and a subtraction are faster than a subtraction of two types
         np.subtract(self.scratch, self.dark, out=self.scratch)
         sums = self.rows.dot(self.scratch)  # takes half a microsecond less than `@`
@@ -68,7 +68,7 @@ def difference(calibration: Calibration, pixels: Pixels, min_flux_dn: float, out
 
 
 def fill_saturated(calibration: Calibration, pixels: Pixels) -> Pixels:
-    """Replace the saturated pixels of a frame (pixels,) DN by dark plus reference, at the flux of the other pixels.
+    """Replace the saturated pixels of a frame (pixels,) DN by dark plus I0, scaled to the flux of the other pixels.
 
     A pixel with a cosmic ray hit carries no wavefront information, but its charge would enter the modal errors.
     """

@@ -47,15 +47,15 @@ class Spans(NamedTuple):
 
     block: int
     cross_fade: int
-    better: int
+    waiting: int
     long_term: int
 
     @classmethod
     def at(cls, rate_hz: float) -> "Spans":
         """The durations at a frame rate."""
         block = max(MIN_BLOCK_FRAMES, round(BLOCK_S * rate_hz))
-        better, long_term = (max(1, round(seconds * rate_hz / block)) for seconds in (BETTER_S, LONG_TERM_S))
-        return cls(block, max(1, round(CROSS_FADE_S * rate_hz)), better, long_term)
+        waiting, long_term = (max(1, round(seconds * rate_hz / block)) for seconds in (BETTER_S, LONG_TERM_S))
+        return cls(block, max(1, round(CROSS_FADE_S * rate_hz)), waiting, long_term)
 
 
 class Group(NamedTuple):
@@ -94,7 +94,7 @@ class Group(NamedTuple):
         if self.overruled:
             better = not void and virtual_nm2 < BETTER_RATIO * error_nm2
             after = after._replace(blocks=self.blocks + 1 if better else 0)
-            if self.final or after.blocks < spans.better * 2 ** (self.takeovers - 1):
+            if self.final or after.blocks < spans.waiting * 2 ** (self.takeovers - 1):
                 return after, ""
             return after._replace(overruled=False, blocks=0), LAW_RETURNS
         worse = not void and error_nm2 > WORSE_RATIO * virtual_nm2
@@ -262,7 +262,7 @@ def _events(law: LinearLaw, spans: Spans, judged: Sequence[tuple[Group, str]]) -
         if why == LAW_RETURNS:
             events.append(PendingEvent("LAW_BACK", {"law": law.name, "modes": modes}))
         elif why:
-            wait_s = spans.better * spans.block / law.rate_hz * 2 ** (group.takeovers - 1)
+            wait_s = spans.waiting * spans.block / law.rate_hz * 2 ** (group.takeovers - 1)
             until = (
                 "until the law is loaded again or the loop is closed again"
                 if group.final

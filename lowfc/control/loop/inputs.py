@@ -42,7 +42,8 @@ class Request:
 
     Attributes:
         modes: Noll indices that the values are for; empty for all.
-        values: one for all modes, or one for each; number of frames of a step; or duration of a lease or permit, s.
+        values: one for all modes, or one for each; for `step` the number of frames for which the loop closes; for a
+            lease or permit its duration, s.
         text: name of a channel, target of a probe sequence, holder of a lease, or a note; `AUTO` for automatic gains.
         actuators_nm: one or more shapes of the mirror, concatenated, nm of surface.
         table: (frames, columns) of a probe sequence.
@@ -53,7 +54,8 @@ class Request:
         prepared: whether the checks that need no state are done; see `lowfc.control.loop.requests.prepared`.
         lease_id: identity of the sender's lease, or of the requested lease; 0 for none.
         requester: user and program that sent the request, for people.
-        prior_nm2: mean squares (modes,) of the uncorrected modes, nm^2, by which automatic gains weight R.
+        prior_nm2: (modes,) mean square of each mode that automatic gains leave uncorrected, nm^2, 0 for a corrected
+            mode: the prior with which R is computed again.
         flux_dn: the flux at which `prior_nm2` was measured, DN.
     """
 
@@ -155,8 +157,8 @@ class Command(NamedTuple):
 
     Attributes:
         safe: whether the loop is in safe mode.
-        clear_id: identity of the operator's last clear; if none, 0 or, before the first frame, the time of the mode's
-            beginning.
+        clear_id: identity of the operator's last `clear`. Without one it is 0; before the first frame it is the time at
+            which the loop mode began, so that a mirror that has applied newer frames accepts the command.
     """
 
     frame_sequence: int

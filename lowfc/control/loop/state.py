@@ -137,7 +137,7 @@ class LawRunner(NamedTuple):
 
 
 class Weighting(NamedTuple):
-    """Weighting of R, as for `map_rows`.
+    """Prior and flux from which `map_rows` computes R for automatic gains.
 
     Attributes:
         prior_nm2: (modes,) mean square of each uncorrected mode, nm^2; 0 for a mode that the loop corrects.
@@ -309,7 +309,7 @@ class State(NamedTuple):
         steps_left: used frames until the loop opens automatically; 0 for never.
         returning_to_zero: whether the modal command is returning to zero.
         estimate: the last measurement.
-        identical_frames: number of measurements in a row directly before it that were equal to it.
+        identical_frames: number of consecutive measurements before `estimate` that were equal to it.
         input_number: count of the inputs that changed the state or produced output; the order of replay.
     """
 
@@ -333,7 +333,7 @@ class State(NamedTuple):
 
     @property
     def may_command(self) -> bool:
-        """Whether commands may be sent; the first command to a faulty mirror, which might jump, only in safe mode."""
+        """Whether commands may be sent. The first to a mirror with a fault, which might jump, needs safe mode."""
         return self.commanded or not self.conditions.mirror_fault or self.mode is LoopMode.SAFE
 
     @property

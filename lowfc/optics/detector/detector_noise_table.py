@@ -23,7 +23,7 @@ _ENTRIES = 1 << _ENTRIES_BITS
 _FRACTION_BITS = 16  # resolution of the probability of rounding up
 _MAX_TABULATED_E = 64  # electrons, exclusive; a pixel with a mean of 24 e- reaches 64 once in 1e11 frames
 _TAIL = 8.0  # tabulated range of the read noise, standard deviations
-_WIDEST = 256  # most digital numbers that are tabulated
+_WIDEST = 256  # largest number of tabulated digital numbers
 _MIN_NOISE_DN = 0.05  # the table divides by the read noise, which may be 0
 _REMAINDER = 65535  # never a tabulated digital number, since those are below saturation
 
@@ -34,7 +34,8 @@ class NoiseTable:
 
     Attributes:
         entries: (means, entries) digital numbers, all equally likely; `_REMAINDER` where `remainder` decides.
-        remainder: (means, numbers) cumulative distribution of what the entries leave of each probability: below 1/1024.
+        remainder: (means, numbers) cumulative distribution of the parts of the probabilities, each below 1/1024, that
+            the entries do not represent.
         first_dn: Digital number of the first column of `remainder`.
     """
 
@@ -47,8 +48,8 @@ def noise_table(gain_e_per_dn: float, read_noise_e: float, bias_dn: float, satur
     """Table for a detector without electron multiplication.
 
     Returns:
-        The table, or None if it does not apply: read noise below 0.05 DN; digital numbers that reach below 0 or the
-        saturation level; or more than 256 of them.
+        The table, or None if it does not apply: read noise below 0.05 DN; digital numbers below 0, or not
+        below the saturation level; or more than 256 of them.
     """
     noise_dn = read_noise_e / gain_e_per_dn
     first = int(np.floor(bias_dn - _TAIL * noise_dn))

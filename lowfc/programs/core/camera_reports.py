@@ -1,4 +1,4 @@
-"""The camera's settings: received when published, queried if frames need them."""
+"""The camera's settings: received when published, and queried until they arrive after a start."""
 
 import time
 from collections.abc import Callable
@@ -19,7 +19,7 @@ QUERY_PERIOD_NS = 500_000_000
 
 
 class CameraReports:
-    """Receives the camera's settings, in `mailbox`, and passes them to a callback."""
+    """The newest message of the camera's settings is in `mailbox`; `apply` passes its content to a callback."""
 
     def __init__(self, service: Service, apply: Callable[[CameraSettings], None]) -> None:
         self._service, self._apply = service, apply
@@ -49,7 +49,8 @@ class CameraReports:
         deadline_ns = clock.host_ns() + (LOCKSTEP_WAIT_NS if clock.lockstep else 0)
         while self._service.running:
             for sample in self._service.bus.get(CAMERA_STATE.key, timeout_s=0.2):
-                # The clock's time, not the camera's: the answer may be the message published with the first frame.
+                # The clock's time, not the camera's: the answer may be the message before the first frame or the one
+                # with it. Their times differ, so that two runs would.
                 self.apply(sample, clock.now_ns() if clock.lockstep else None)
                 return
             if clock.host_ns() >= deadline_ns:

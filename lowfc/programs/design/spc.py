@@ -127,15 +127,15 @@ def _rounds(request: Request, console: Console) -> list[Round]:
 
 
 def _infeasible(request: Request, inner: float | None, contrast: float | None) -> str:
-    """Message for an infeasible request, with the nearest feasible inner angle and contrast."""
+    """Message for an infeasible request, with the nearest feasible inner radius and contrast."""
     ways = []
     if inner is not None:
-        ways.append(f"inner angle is {inner:g} (same contrast)")
+        ways.append(f"inner radius is {inner:g} (same contrast)")
     if contrast is not None:
-        ways.append(f"contrast is {contrast:g} (same angle)")
+        ways.append(f"contrast is {contrast:g} (same radius)")
     nearest = f"the nearest feasible {', or '.join(ways)}" if ways else "nothing near it is feasible"
     return (
-        f"inner angle {request.inner:g} lambda/D at contrast {request.contrast:g} is infeasible (masks that meet both "
+        f"inner radius {request.inner:g} lambda/D at contrast {request.contrast:g} is infeasible (masks that meet both "
         f"are open over less than {MIN_OPEN_AREA:.0%} of the circle); {nearest}"
     )
 

@@ -21,7 +21,7 @@ from lowfc.control.laws.spectra import (
     time_series,
 )
 from lowfc.control.laws.stability import delay_weights, settling_frames
-from lowfc.control.laws.transfer_function import departure, measure_lines, seen_of_mirror
+from lowfc.control.laws.transfer_function import departure, measure_lines, modes_seen
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.safety import LoopMode
@@ -153,7 +153,7 @@ def test_the_measured_rejection_agrees_with_theory(target: str, delay_frames: fl
     request = Request(0, "play", text=target, table=table, actuators_nm=shapes.astype(np.float32))
     error_nm, _, _ = run_probe(setup, request)
     weights = delay_weights(delay_frames)
-    added = -period.astype(float) if target == "offset" else seen_of_mirror(period.astype(float), weights)
+    added = -period.astype(float) if target == "offset" else modes_seen(period.astype(float), weights)
     measured = measure_lines(error_nm[lead:], added)
 
     assert [np.sort(np.round(measured.frequency[measured.mode == mode] * PERIOD)).tolist() for mode in range(3)] == [

@@ -81,7 +81,7 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> N
         floors[name] = _floor_nm(response)
         rms[name] = np.nanstd(response.error_nm, axis=0)
     loop = by_loop["closed"].loop
-    gain = np.sqrt(margins.noise_gain(loop.linear, loop.delay_frames, held=True))
+    gain = np.sqrt(margins.noise_gain(loop.linear, loop.delay_frames, continuous=True))
     modes = [
         NoiseMode(
             noll=noll,

@@ -12,7 +12,7 @@ from lowfc.control.calibration.excitation import lines, multisine, with_lead_in
 from lowfc.control.laws import margins
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
-from lowfc.control.laws.transfer_function import Departure, Lines, departure, measure_lines, seen_of_mirror
+from lowfc.control.laws.transfer_function import Departure, Lines, departure, measure_lines, modes_seen
 from lowfc.control.loop.command_channels import OFFSET
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.control.loop.wording import counted
@@ -139,7 +139,7 @@ def transfer_function(response: ProbeResponse) -> Lines:
             "`lowfc ctl law integrator`, then measure again"
         )
     period = response.table[-response.parameters["period_frames"] :].astype(float)
-    added = -period if response.target == OFFSET else seen_of_mirror(period, delay_weights(response.loop.delay_frames))
+    added = -period if response.target == OFFSET else modes_seen(period, delay_weights(response.loop.delay_frames))
     return measure_lines(response.filled(response.error_nm)[-len(period) :], added)
 
 

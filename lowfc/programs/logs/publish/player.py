@@ -57,8 +57,8 @@ def publish(
         run_id: name of the run; created if it does not exist.
         speed: 2 is twice as fast, a large number as fast as possible. Subscribers that do not keep up lose messages, as
             with a live camera.
-        topics: keys or shell patterns of keys; if empty, all topics, except commands, of those roles of the loop that
-            are not live.
+        topics: keys or shell patterns of keys; if empty, events and all topics, except commands, of those roles of the
+            loop that are not live.
         allow_commands: publish commands too, and frames even if they would move a live mirror.
         wait_for: roles that must be running and connected before the first message; their topics are not published.
 
@@ -241,7 +241,7 @@ def _wait_for_receivers(service: Service, live: Collection[str], wait_for: Colle
     while missing and service.running:
         missing = service.wait_for(missing, _WAIT_FOR_S)
     begun_s = time.monotonic()
-    service.wait_for(live, _WAIT_FOR_S)  # no longer: a user's program may send no Health
+    service.wait_for(live, _WAIT_FOR_S)  # and not longer, because a user's program may never publish Health
     while service.running and time.monotonic() - begun_s < _SETTLE_S:
         time.sleep(0.02)
     return service.running

@@ -60,10 +60,10 @@ def percentiles_us(durations_ns: Long) -> Results:
 
 
 def frame_counts(history: History) -> Results:
-    """Frames in the log, frames without a step and thus a command, and the counts of camera and controller.
+    """Frames in the log, frames without a step (and thus without a command), and counts of camera and controller.
 
-    Every frame that reaches the controller leads to a step and, with a calibration, to a command; frames that the
-    controller skipped (a newer one arrived first) or missed (never arrived) have neither. The last frames, whose
+    Every frame that the controller takes leads to a step and usually to a command; frames that it skipped (too many
+    waited) or missed (never arrived) have neither. The last frames, whose
     commands may be after the end of the log, are counted separately. The controller's own counts begin at its start,
     which may be before the start of the log. Only the simulated camera counts late commands.
     """

@@ -98,7 +98,7 @@ def render(results: dict[str, Any]) -> str:
         for rate in results["rates"]
     ]
     lines.append(
-        "Processor: share of one processor that the recorder uses; x copying: the same over that of copying a frame's "
+        "Processor: share of one processor that the recorder uses; x copying: this share / that of copying a frame's "
         f"{results['payload_bytes_per_frame']:.0f} bytes to the same disk ({results['copy_us_per_frame']:.1f} us). "
         "Longest wait: from a message's arrival until it is written; unflushed: until it survives a kill -9; write: "
         "one write to the disk."

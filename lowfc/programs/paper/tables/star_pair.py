@@ -30,7 +30,9 @@ ASSUMPTION = (
     "Hz; black bodies of 20,000 K (V = 2) and 5,800 K (V = 5) over the band of 20 %, in four wavelengths. A roll steps "
     f"every mode by {ROLL_NM:g} nm; the loop on the target corrects it."
 )
-MAP = "Rms over the dark zone of the difference of the two long exposures, without photon noise of the science camera."
+RMS_NOTE = (
+    "Rms over the dark zone of the difference of the two long exposures, without photon noise of the science camera."
+)
 
 
 def coloured(temperature_K: float) -> Band:
@@ -55,7 +57,7 @@ def _maps() -> tuple[Array, Array, Mask]:
 
 
 def zero_point_nm(name: str) -> Array:
-    """Modes (14,), nm, at which a loop with the reference star's I0 and R holds the target, due to its other colour."""
+    """Offset (14,), nm, of a loop on the target with the reference star's I0 and R: the effect of its colour."""
     sensor = prepared(name)
     reference_star, target = (coloured(kelvin) for _, kelvin in STARS.values())
     I0, H = reference(sensor.optics, reference_star).ravel(), response(sensor.optics, sensor.modes[:14], reference_star)
@@ -91,7 +93,7 @@ def pair_rows(name: str) -> Iterator[Row]:
         yield new_row(
             f"rms contrast after subtraction, {reference_image}",
             measured=float(np.sqrt(np.mean(change[zone] ** 2))),
-            assumption=f"{ASSUMPTION}\n{MAP}",
+            assumption=f"{ASSUMPTION}\n{RMS_NOTE}",
         )
     form = tolerance.contrasts_of(name).form
 

@@ -21,7 +21,7 @@ MAX_RATIO = 2.0
 FLOOR_NM = 1.0
 """Allowance for the noise of the residual, added to the limit from `MAX_RATIO`."""
 FLUSHED_S = 1.0
-"""Messages recorded longer than this before a kill must be in the log, which is flushed four times a second."""
+"""Messages recorded earlier than this before a kill must be in the log, which is flushed four times a second."""
 SPAN_NS = 1_000_000_000
 """Time over which the residual is averaged before the fault and at the end."""
 RMS_FRAMES = 50
@@ -159,7 +159,7 @@ def _bad_frames(case: Case, evidence: Evidence) -> Finding:
 
 
 def _recovery(case: Case, outcome: Outcome, evidence: Evidence) -> Finding:
-    """At the end the loop is closed with the former residual; or, if the case requires it, safe with a flat mirror."""
+    """At the end the loop is closed with about the former residual or, if the case requires it, safe and flat."""
     before = evidence.residual_nm(outcome.settled_ns - SPAN_NS, outcome.settled_ns)
     after = evidence.residual_nm(outcome.end_ns - SPAN_NS, outcome.end_ns)
     if np.isnan(after) and outcome.failure and outcome.residuals_nm:  # the recording ended before the loop did
@@ -202,7 +202,7 @@ def _account(outcome: Outcome, evidence: Evidence) -> Finding:
     for publication, received in evidence.received.items():
         _, key, _ = publication
         missing[key] += received.missing
-        if key != FRAME.key:  # a faulty camera sends more or fewer frames than it numbers
+        if key != FRAME.key:  # a camera with an injected fault repeats or drops frames
             missing[key] += max(0, evidence.sent.get(publication, 0) - received.next)
     wrong += [
         f"{key}: {count} missing, {counted.get(key, 0)} counted as lost"

@@ -82,7 +82,7 @@ class Plot:
 
 
 class Axes:
-    """A box with its own axes, possibly logarithmic, and ticks; rerun's plots lack these and drop the oldest points."""
+    """A box with linear axes and any ticks; rerun's plots have no such ticks, and drop the oldest points."""
 
     def __init__(self, path: str, width: float) -> None:
         self.path = path

@@ -24,8 +24,8 @@ from lowfc.programs.view.verdicts.watcher import FRAMES_SILENT_S
 
 _MODES = {mode.value: mode for mode in LoopMode}
 _MAX_KEPT = 8192
-"""Most steps, and most wavefronts without a step, that are kept: a loaded host may record a step seconds late."""
-_NAMES = {LoopMode.OPEN: "open", LoopMode.SAFE: "safe", LoopMode.IDLE: "idle", None: "without frames"}
+"""Largest number of kept steps, and of kept wavefronts without a step: a loaded host may record steps seconds late."""
+_NAMES = {LoopMode.OPEN: "open", LoopMode.SAFE: "safe", LoopMode.IDLE: "idle", None: "without steps"}
 
 _LEVELS = {Correction.GOOD: Level.GOOD, Correction.LITTLE: Level.NEUTRAL, Correction.HARM: Level.WARNING}
 
@@ -60,7 +60,7 @@ class LogVerdict:
         tiles = (loop, wavefront, *others)
         worst = worst_of(tiles)
         level = worst.level if worst.level >= Level.WARNING else min(loop.level, wavefront.level)
-        headline = f"Log without a step of the controller{' at a valid time' if state.totals['steps'] else ''}"
+        headline = f"Log without a step of the controller{' with a valid time' if state.totals['steps'] else ''}"
         if self._first_ns:
             begin = datetime.fromtimestamp(self._first_ns * 1e-9, UTC)
             span = duration((self._last_ns - self._first_ns) * 1e-9)
@@ -116,9 +116,10 @@ class LogVerdict:
         compared = f"{factor:.1f} x better" if factor >= 1 else "worse"
         includes_shapes = self._closed.true and self._shape_held
         shapes = " with offset and channels," if includes_shapes else ""
+        kind = "true (simulated)" if self._closed.true else "measured, with noise"
         detail = (
             f"while closed,{shapes} {compared} than {rounded(flat_nm)} nm with a flat mirror; worst "
-            f"{_span(self._closed)}: {rounded(worst_nm)} nm; {'true' if self._closed.true else 'measured, with noise'}"
+            f"{_span(self._closed)}: {rounded(worst_nm)} nm; {kind}"
         )
         level = _LEVELS[Correction.LITTLE if includes_shapes and factor < 1 else correction(residual_nm, flat_nm)]
         value, than = f"{rounded(residual_nm)} nm rms", "worse than " if level is Level.WARNING else ""

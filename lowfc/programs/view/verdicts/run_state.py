@@ -31,7 +31,7 @@ class Liveness(Enum):
     STARTING = auto()
     RUNNING = auto()
     STOPPED = auto()  # on request
-    SILENT = auto()  # no message for 2 s or ten frame periods: hung or killed
+    SILENT = auto()  # no message for 2 s, or ten frame periods if longer: hung or killed
 
 
 class Process(NamedTuple):
@@ -61,8 +61,9 @@ class RunState:
         rate_hz: frame rate, from the times of the steps; None with fewer than two steps.
         controller, camera, mirror, recorder: liveness of the processes; with several mirrors that of the worst.
         frame_silent_s, step_silent_s: time without a frame or step; None up to 1 s, or ten frame periods if longer.
-        recent, now, totals: counts of each reason, of "steps", and of "skipped", "missing", "late" and "lost", in
-            `RECENT_S`, in `NOW_S` (both at least `PERIODS` frame periods) and since the first snapshot.
+        recent, now, totals: counts in `RECENT_S`, in `NOW_S` (both at least `PERIODS` frame periods) and since the
+            first snapshot: of each reason; of "steps"; of frames "skipped" by a busy controller, or "missing" as they
+            never arrived; of commands "late" for the next exposure; of messages "lost" by the recorder.
         flux: light on the newest frame as a fraction of the calibration's; None without a frame or calibration.
         saturated: number of good pixels at full well in the newest frame.
         wavefront: rms of the last second; once the controller was stopped, of its last second with a step. `latest` is

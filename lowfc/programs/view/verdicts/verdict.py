@@ -95,7 +95,7 @@ def _loop(state: RunState) -> Tile:
         advice = "Loop in safe mode: the mirror stays flat until `lowfc ctl clear`; do that when it is safe."
         return tile("SAFE", state.mode_cause or "mirror flat, latched", Level.BAD, advice)
     if mode is LoopMode.IDLE:
-        advice = "There is no calibration for these frames: the controller refuses every one. Load or measure one."
+        advice = "There is no calibration for these frames: the controller refuses every frame. Load or measure one."
         return tile("IDLE", state.mode_cause or "no calibration", Level.WARNING, advice)
     if mode is LoopMode.OPEN:
         return _open(state)
@@ -104,7 +104,7 @@ def _loop(state: RunState) -> Tile:
     if held := _held(reported):
         advice = f"The loop is closed but does not correct: {held}."
         return tile("HOLDING", f"closed, but not correcting: {held}", Level.WARNING, advice)
-    if mirror.life is Liveness.SILENT:  # in logs of version 0.1, which have no mirror fault
+    if mirror.life is Liveness.SILENT:  # only in logs of version 0.1, whose states have no `mirror_fault`
         return tile("CLOSED", "but the mirror is silent", Level.WARNING)
     if camera.life is Liveness.STOPPED:
         advice = "The camera was stopped: the loop is closed but does not correct."
@@ -146,7 +146,7 @@ def _since(state: wire.ControllerState | None) -> str:
 def _open(state: RunState) -> Tile:
     shape, rms = "mirror holds its last shape", state.wavefront
     if rms is not None and correction(rms.residual_nm, rms.open_nm) is Correction.HARM:
-        shape += ", worse than a flat mirror: `lowfc ctl safe` flattens it"
+        shape += ", worse than a flat mirror: `lowfc ctl safe` relaxes it to flat"
     level, advice = Level.NEUTRAL, "The loop is open: nothing is corrected, `lowfc ctl close` closes it."
     if state.mode_cause == MEASURED_FIRST:
         advice = "The loop is open until its gains are measured, and then closes by itself."
