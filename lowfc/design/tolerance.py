@@ -1,8 +1,8 @@
 """Tolerances of drift and vibration lines, from theory: the largest whose residual adds an allowed contrast.
 
-A mode drifts as a random walk of variance D per frame. Its mean over an exposure of e frame periods (e <= 1) is measured
-with noise of variance n; a command takes effect at the next frame. Let r be the residual at the start of a frame, d
-the drift during the frame, and m the mean over the exposure of the drift since the start of the frame. Then
+A mode drifts as a random walk of variance D per frame. The mean over an exposure of e frame periods (e <= 1) is
+measured with noise of variance n; a command takes effect at the next frame. Let r be the residual at the start of a
+frame, d the drift during the frame, and m the mean over the exposure of the drift since the start of the frame. Then
 
     r' = r + d - g (r + m + noise),    var d = D, var m = D e / 3, cov(d, m) = D e / 2
 

@@ -178,7 +178,7 @@ def test_frames_two_seconds_apart_leave_no_gap_and_a_frame_with_a_wrong_time_add
     night = SyntheticLog()
     night.put(STEP, step)
     drawn(night.write(tmp_path / "step.mcap"))
-    assert shown[-1].headline.startswith("Log without a step of the controller at a valid time")
+    assert shown[-1].headline.startswith("Log without a step of the controller with a valid time")
 
 
 @pytest.mark.parametrize(

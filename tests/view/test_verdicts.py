@@ -98,7 +98,7 @@ MISFIT = f"{CAMERA_MISFIT}: bias_dn is 260"
 OTHER_SIZE = "the computed calibration is for frames of 32 x 32 pixels, the camera's are 64 x 64"
 LEASE = wire.Lease(holds=True, holder="calibrate")
 ALL_PROCESSES = ("camera", "controller", "mirror-dm", "recorder")
-HARMFUL = "worse than a flat mirror: `lowfc ctl safe` flattens it"
+HARMFUL = "worse than a flat mirror: `lowfc ctl safe` relaxes it to flat"
 STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
     # name: the change; title, value and level of the tile that shows it; a part of the headline
     "healthy": (setting(), "LOOP CLOSED GOOD", "nothing is wrong"),
