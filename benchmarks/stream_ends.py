@@ -62,7 +62,7 @@ class TimedCamera(IsioCamera):
         self._written_ns.append(self._newest_ns)
 
     def close(self) -> None:
-        """Save the times; `due_ns` of a frame is its `atime` here, in a frame source it is the scheduled time."""
+        """Save the times. `due_ns` of a frame is its `atime` here; in a frame source it is the scheduled time."""
         super().close()
         np.savez(
             self._folder / SENT_FILE,

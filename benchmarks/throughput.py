@@ -147,7 +147,7 @@ HEADINGS = (
     "loop",
     "highest rate, Hz",
     "frame to command p50, us",
-    "p99, us",
+    "frame to command p99, us",
     "commands late",
     "why the next rate fails",
 )

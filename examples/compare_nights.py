@@ -18,7 +18,7 @@ def report(log: str) -> dict[str, Any]:
 
 
 def rows(nights: list[dict[str, Any]]) -> dict[str, list[str]]:
-    """Return the text of every night, by the name of the quantity."""
+    """Return the texts of all nights in their order, by the name of the quantity."""
     found: dict[str, list[str]] = {}
     for index, night in enumerate(nights):
         texts = {"verdict": night["verdict"]["heading"]}

@@ -26,7 +26,7 @@ class MirrorPath:
         self._settling = settling
 
     def applied(self, moment: float, shape_nm: Single, latest: float = np.inf) -> None:
-        """Add a shape (rows, columns) applied at `moment`, or at `latest` if earlier, and after the previous shape."""
+        """Add a shape (rows, columns) applied at `moment`, but not after `latest`, nor before the previous shape."""
         self._moves.append((max(min(moment, latest) + self._delay, self._moves[-1][0]), shape_nm))
 
     def motion(self, start: float, instants: Array) -> MirrorMotion:

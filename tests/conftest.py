@@ -38,7 +38,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=start_order)
 
 
-@pytest.hookimpl(optionalhook=True)  # `-p no:xdist` removes this hook
+@pytest.hookimpl(optionalhook=True)  # with `-p no:xdist` no plugin declares this hook
 def pytest_xdist_auto_num_workers() -> int:
     """One worker more than processors, because the worker with the exclusive tests mostly waits."""
     return len(os.sched_getaffinity(0)) + 1

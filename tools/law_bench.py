@@ -73,7 +73,7 @@ class Bench:
         events: frame number and event of the controller, since the start.
         settings: settings of the controller.
         state: state of the controller.
-        watch: comparison of gains and detection of harm; None if the bench does without both.
+        watch: comparison of gains and detection of harm; None if there is neither.
     """
 
     watch: GainWatch | None = None

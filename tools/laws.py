@@ -188,8 +188,9 @@ def render(results: Results) -> str:
         "continuous time (8 samples in each frame); blurred sensor images through the live loop's own `advance`; laws "
         f"identified from {IDENTIFY / RATE_HZ:g} s of the closed loop, measured over {MEASURE / RATE_HZ:g} s, "
         f"{SETTLE / RATE_HZ:g} s after they were loaded. Exact lines: the residual of an LQG law with the exact "
-        "lines of the wheel, and a random walk behind a low-pass as drift. Lines 2 % higher: the residual of the LQG "
-        "law when the lines have moved, and after identification from that run."
+        "lines of the wheel, and a random walk behind a low-pass as drift. Theory: both parts of the first table, "
+        "added in quadrature; identified from 8 s: of a law from the first 8 s. Lines 2 % higher: the residual of the "
+        "LQG law when the lines have moved, and after identification from that run."
     )
 
 

@@ -126,7 +126,7 @@ class ModalBench(Bench):
                 self._squares.append(np.square(modes_nm[2:] + mirror_nm).sum(axis=0) / len(_TRUTH_SAMPLES))
 
     def residual_nm(self, *, continuous: bool = True) -> Array:
-        """True residual (frames, modes) of the record, rms over each period: `continuous` must be True."""
+        """True residual (frames, modes) of the record, rms over each period; ValueError if not `continuous`."""
         if not continuous:
             raise ValueError("a modal bench records only the rms over each frame period")
         return np.sqrt(np.array(self._squares, np.float64))

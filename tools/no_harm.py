@@ -97,7 +97,7 @@ def modal_case(case: tuple[str, str, float]) -> Results:
             ]
         )
         best = fixed[:, :2].sum(axis=1).min() + fixed[:, 2:].sum(axis=1).min()  # tip and tilt; other modes
-        row["ratio_to_best_gains"] = float(np.sqrt(residual_nm2[: len(seeds)].sum(axis=1).mean() / best))
+        row["of_best"] = float(np.sqrt(residual_nm2[: len(seeds)].sum(axis=1).mean() / best))
     return row
 
 
@@ -164,8 +164,8 @@ def render(results: Results) -> str:
             )
     harmful, saturated = [row for row in rows if harms(row)], len(results["rows"]) - len(rows)
     stars = _magnitudes(modal)
-    bright = [row for row in rows if "ratio_to_best_gains" in row]
-    ratios = [row["ratio_to_best_gains"] for row in bright]
+    bright = [row for row in rows if "of_best" in row]
+    ratios = [row["of_best"] for row in bright]
     names = "; ".join(
         "{sensor}, {preset}, V = {magnitude}: {added:.2g}".format(**row, added=row["change"] / row["own"])
         for row in harmful

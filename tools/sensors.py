@@ -15,7 +15,7 @@ from lowfc.adapters.files import factory
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.sections import SENSORS, sensor_keys
 from lowfc.control.calibration.calibration import Calibration, normalise_flux
-from lowfc.design.fisher import cramer_rao, quantum_information, variance_e
+from lowfc.design.fisher import cramer_rao, quantum_information, variance_e2
 from lowfc.optics.chain.sensor import light_budget, pupil_radii, reference, response, shear_response
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
@@ -75,7 +75,7 @@ def alone(name: str) -> Results:
         in_band = configured(name, **{"sensor.wavelengths": 4})
         results["noise_in_band_mas"] = tilt_noise_mas(in_band, calibrated(in_band))
         light = reference(optics).ravel()
-        bound = cramer_rao(response(optics, modes), variance_e(light, 0.0))
+        bound = cramer_rao(response(optics, modes), variance_e2(light, 0.0))
         limit = np.linalg.inv(quantum_information(optics.pupil, modes, optics.wavelength_nm))
         results["quantum_share"] = float(np.median(np.diag(limit) / np.diag(bound)))
         slopes = normalise_flux(light, shear_response(optics), np.ones(light.size))[1]
@@ -102,7 +102,14 @@ def in_the_loop(name: str, preset: str) -> dict[str, float]:
 def render(results: Results) -> str:
     """A row for each sensor."""
     head = [
-        *("`--sensor`", "light, %", "peak, %", "condition number", "quantum limit / bound, %", "tilt noise, mas"),
+        *(
+            "`--sensor`",
+            "light, %",
+            "peak, %",
+            "condition number",
+            "quantum limit / Cramer-Rao bound, %",
+            "tilt noise, mas",
+        ),
         *("tilt noise in the band, mas", "tilt noise, shear fitted, mas", "error from shear, nm", "twin time, us"),
         *(f"`{preset}`: {column}" for preset in PRESETS for column in ("wavefront, nm rms", "tilt, mas rms per axis")),
     ]

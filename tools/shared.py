@@ -50,9 +50,12 @@ def json_of(command: str, folder: Path | str = ROOT) -> Results:
     return results
 
 
+ESCAPED = r"\|"  # a bare one would end the cell of a table
+
+
 def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """A table in Markdown."""
-    first, *lines = [f"| {' | '.join(map(str, line))} |\n" for line in (head, *rows)]
+    first, *lines = [f"| {' | '.join(str(cell).replace('|', ESCAPED) for cell in line)} |\n" for line in (head, *rows)]
     return f"{first}{'|---' * len(head)}|\n{''.join(lines)}"
 
 

@@ -131,16 +131,11 @@ def _field_table(result: type[Result]) -> str:
     for name, info in printed.items():
         extra = info.json_schema_extra if isinstance(info.json_schema_extra, dict) else {}
         rows.append(
-            (f"`{info.alias or name}`", f"`{_type(info.annotation)}`", extra.get("unit", ""), _cell(info.description))
+            (f"`{info.alias or name}`", f"`{_type(info.annotation)}`", extra.get("unit", ""), info.description or "")
         )
     for name, computed in result.model_computed_fields.items():
-        rows.append((f"`{name}`", f"`{_type(computed.return_type)}`", "", _cell(one_line(computed.description))))
+        rows.append((f"`{name}`", f"`{_type(computed.return_type)}`", "", one_line(computed.description)))
     return markdown(("key", "type", "unit", "label"), rows)
-
-
-def _cell(text: str | None) -> str:
-    """A text as the cell of a table, in which | would end the cell."""
-    return (text or "").replace("|", r"\|")
 
 
 def _type(annotation: Any) -> str:

@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_limits
 from lowfc.adapters.files.factory import frame_noise_nm
 from lowfc.arrays import Array
 from lowfc.contract.configuration import FIXED_GAINS, Configuration
-from lowfc.design.fisher import cramer_rao, variance_e
+from lowfc.design.fisher import cramer_rao, variance_e2
 from lowfc.optics.chain.zernike import mode_name
 from tools.law_bench import Bench, calibrated, configured
 from tools.shared import Results, markdown
@@ -56,7 +56,7 @@ def case(config: Configuration) -> Results:
         mirror_error_nm[window] = residual_nm[window] - drift_nm[window] - command_nm
     light_e = calibration.flux_dn * config.camera.gain_e_per_dn
     H, I0 = (array.astype(np.float64) * (light_e * frames) for array in (calibration.response, calibration.reference))
-    bound_nm = np.sqrt(np.diag(cramer_rao(H, variance_e(I0, 0.0))))
+    bound_nm = np.sqrt(np.diag(cramer_rao(H, variance_e2(I0, 0.0))))
     noise_nm = frame_noise_nm(config, calibration) / np.sqrt(frames)
     columns = {
         "drift_nm": _rms(drift_nm),

@@ -24,8 +24,9 @@ def _row(quantity: str, limit: float, values: Sequence[float], form: str, bound:
     """Row of a quantity with one value for each turn; `bound` of any such program; `excess`: work beyond the bound."""
     reached, shown = median(values), form.format
     spread = f" ({shown(min(values))} to {shown(max(values))})" if len(values) > 1 else ""
-    met = "yes" if reached <= limit else "no" if shown(reached) != shown(limit) else f"no: {reached:.5g}"
-    return quantity, f"at most {shown(limit)}", shown(reached) + spread, met, bound, excess
+    met = "yes" if reached <= limit else "no"
+    exact = shown(reached) if met == "yes" or shown(reached) != shown(limit) else f"{reached:.5g}"
+    return quantity, f"at most {shown(limit)}", exact + spread, met, bound, excess
 
 
 def _steps(results: Results) -> Iterator[Row]:
@@ -50,7 +51,7 @@ def _comparison(results: Results) -> Iterator[Row]:
     for other, targets in (("C chain", {"p50": 40.0, "p99": 80.0}), ("pyrtcao, fused", {"p50": 0.0, "p99": 0.0})):
         for at, limit in targets.items():
             differences = [fused[at] - compared[at] for fused, compared in pairs(runs, other)]
-            quantity = f"frame to command, lowfc minus {other.replace(',', '')}, {at}, us"
+            quantity = f"frame to command, lowfc's fused step minus {other}, {at}, us"
             excess = ways if other == "C chain" else f"{sockets}; also checks, limits and messages that pyrtcao lacks"
             yield _row(quantity, limit, differences, "{:+.0f}", "0 for the same work in C", excess)
 

@@ -135,7 +135,7 @@ def versions(options: argparse.Namespace) -> dict[str, str]:
     found = {name: importlib.metadata.version(name) for name in ("lowfc", "eclipse-zenoh", "numpy")}
     command = [options.pyrtcao, "-c", "import importlib.metadata as m; print(m.version('pyrtcao'))"]
     with contextlib.suppress(OSError):
-        done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603  # the user's own interpreter
+        done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603  # the user's
         if not done.returncode:
             found["pyrtcao"] = done.stdout.strip()
     with contextlib.suppress(OSError, TypeError):

@@ -66,7 +66,7 @@ class Control(Section):
     """Loop mode once a calibration is loaded; with automatic gains, closed takes effect once these are measured.
     sim-loop starts closed if the file does not set this key."""
     delay_frames: float = Field(0.0, ge=0, le=10)
-    """Measured delay in frames, defined as camera.delay_frames; 0: that value. Doubling the delay about halves the
+    """Measured delay in frames, counted as camera.delay_frames is; 0: its value. Doubling the delay about halves the
     highest stable gain."""
     estimator: Literal["weighted", "pinv"] = "weighted"
     """Pseudo-inverse of H. weighted: noise-weighted; pinv: plain."""

@@ -10,8 +10,8 @@ from lowfc.control.calibration.calibration import SINGULAR_CONDITION, condition_
 from lowfc.optics.chain.grid import OPEN_AREA
 
 
-def variance_e(reference_e: Array, read_noise_e: float) -> Array:
-    """Variance (pixels,) of photon and read noise in the image of a flat wavefront (the paper's Sects. 3 and 3.3).
+def variance_e2(reference_e: Array, read_noise_e: float) -> Array:
+    """Variance (pixels,), e-^2, of photon and read noise in the flat wavefront's image (the paper's Sects. 3, 3.3).
 
     Rounding to whole electrons is neglected: its 1/12 e-^2 changes no scatter of Table 4 by more than 1 %.
 

@@ -1,7 +1,8 @@
 """Predicted performance of a sensor: the values that a search can minimise.
 
-A `Candidate` provides I0 and H, eqs. (8) and (12) of the paper. These determine its values in the paper's Tables 3 and
-4, and the contrast that the noise of an exposure adds to the dark zone.
+A `Candidate` provides I0 and H, eqs. (8) and (12) of the paper, the latter with the factor 2 of eq. (9), and its
+nonlinear error. These determine its values in the paper's Tables 3 and 4, and the contrast that the noise of an
+exposure adds to the dark zone.
 """
 
 from dataclasses import dataclass
@@ -24,18 +25,18 @@ WAVELENGTH_NM = 550.0  # central wavelength, Table 1 of the paper
 BAND = uniform(WAVELENGTH_NM)
 """Passband of Table 4."""
 CONTROLLED = len(NOLLS_14)
-"""Number of controlled modes: their noise, added contrast and ratio to the quantum limit are predicted."""
+"""Number of controlled modes: their noise, added contrast and share of the quantum limit are predicted."""
 
 
 @dataclass(frozen=True)
 class Signal:
-    """Reference image and response of a sensor in one band.
+    """Reference image and response of a sensor in one band, on its pixels or on a coarser grid that samples it fully.
 
     Attributes:
         I0: (samples,) image of a flat wavefront, fraction of the open circle's light per pixel.
         H: (samples, modes) derivative of the image per nm rms of each mode.
         pixels_per_sample: Number of pixels that each sample represents.
-        peak: Largest value of a pixel of I0; in a band, largest value of a sample.
+        peak: Largest value of I0: of a pixel, or in a band of a sample.
     """
 
     I0: Array

@@ -168,9 +168,8 @@ def exchange(request: Request) -> Iterator[Round]:
             maxima, maxima_signs = _maxima(quarter, request, level * (1 + 1e-6))
             points, signs = np.concatenate([points, maxima]), np.concatenate([signs, maxima_signs])
             multipliers = np.concatenate([multipliers, np.zeros(len(maxima))])
-        if (
-            is_open
-        ):  # drop each point's limit for the opposite sign of the field, which hardly ever acts with more cells
+        # Drop each point's limit for the opposite sign of the field, which hardly ever acts with more cells.
+        if is_open:
             relevant = (signs * _field_at(quarter, points) > 0) | (multipliers > 0)
             points, signs, multipliers = points[relevant], signs[relevant], multipliers[relevant]
 

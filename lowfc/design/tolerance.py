@@ -1,4 +1,4 @@
-"""Tolerances of drift and vibration lines, from theory: the largest whose residual adds an allowed contrast.
+"""Tolerances of drift and vibration lines, from theory: the largest that add an allowed contrast in a loop.
 
 A mode drifts as a random walk of variance D per frame. The mean over an exposure of e frame periods (e <= 1) is
 measured with noise of variance n; a command takes effect at the next frame. Let r be the residual at the start of a
@@ -117,9 +117,7 @@ def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> 
     return lambda allowed: np.asarray(np.exp(np.interp(np.log(allowed), residuals, np.log(_LINE_RATIOS))))
 
 
-def tolerated_variance(quadratic: float, quartic: float, contrast: float) -> float:
-    """Variance, nm^2, of a Gaussian mode that adds this mean contrast; a adds `quadratic` a^2 + `quartic` a^4."""
-    root = np.sqrt(
-        quadratic**2 + 12.0 * max(quartic, 0.0) * contrast
-    )  # the mean of a^4 is three times the variance squared
-    return float(2.0 * contrast / (quadratic + root))
+def tolerated_variance(form: float, quartic: float, contrast: float) -> float:
+    """Variance, nm^2, of a Gaussian mode that adds this mean contrast; an amplitude a adds form a^2 + quartic a^4."""
+    root = np.sqrt(form**2 + 12.0 * max(quartic, 0.0) * contrast)  # the mean of a^4 is three times the variance squared
+    return float(2.0 * contrast / (form + root))

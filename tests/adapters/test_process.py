@@ -103,7 +103,7 @@ def test_a_child_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
     until(lambda: not command_line(pid))
 
 
-def test_a_child_has_no_process_around_it_and_its_own_session_and_its_output_is_kept(tmp_path: Path) -> None:
+def test_a_child_is_the_program_itself_with_its_own_session_and_its_output_is_kept(tmp_path: Path) -> None:
     program = "import os, sys; print('done'); sys.stderr.write(repr((os.getpid(), os.getsid(0), os.environ['WORD'])))"
     environment, out = {**os.environ, "WORD": "received"}, tmp_path / "stdout"
     child = Child("one", [sys.executable, "-c", program], tmp_path / "stderr", environment, stdout_path=out)

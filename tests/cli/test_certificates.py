@@ -235,12 +235,12 @@ def test_certificates_are_warned_about_before_they_expire(tmp_path: Path) -> Non
 
 def test_errors_name_the_file_or_option_at_fault(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="by which other hosts reach it"):
-        make(tmp_path / "empty", (ROUTER,), [])
+        make(tmp_path / "absent", (ROUTER,), [])
     with pytest.raises(ConfigurationError, match=r"without port; got 'host:7447'"):
-        make(tmp_path / "empty", (ROUTER,), ["host:7447"])
-    with pytest.raises(ConfigurationError, match="empty has no authority whose certificates could be renewed"):
-        make(tmp_path / "empty", (ROUTER,), ["host"], renew=True)
-    assert not (tmp_path / "empty").exists()
+        make(tmp_path / "absent", (ROUTER,), ["host:7447"])
+    with pytest.raises(ConfigurationError, match="absent has no authority whose certificates could be renewed"):
+        make(tmp_path / "absent", (ROUTER,), ["host"], renew=True)
+    assert not (tmp_path / "absent").exists()
     make(tmp_path / "old", (ROUTER,), ["host", "10.0.0.1"])
     assert make(tmp_path / "old", (ROUTER,), ["10.0.0.1"]) == []
     with pytest.raises(ConfigurationError, match=r"not for host2, 10\.0\.0\.2: renew it"):

@@ -188,7 +188,7 @@ def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(monkeyp
     assert not result["recommended"]
     assert result["snr_reached"] < 200
     assert "200 required: find what disturbs this mode, or measure about" in result["faults"][0]
-    assert "--resume --snr 200 --cycles " in result["faults"][0]  # --cycles alone would require a signal-to-noise of 20
+    assert "--resume --snr 200 --cycles " in result["faults"][0]  # --cycles alone would require an SNR of 20
     assert result["file"] == "night.rejected.fits"
     assert calibration_file.load(Path("night.rejected.fits")).id != before.id
     assert not Path("night.fits").exists(), "an existing calibration would be overwritten"

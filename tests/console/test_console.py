@@ -407,7 +407,7 @@ def test_the_configuration_is_queried_until_it_is_known(run: LiveRun, monkeypatc
     assert console_feed._config == CONFIG
 
 
-def test_states_are_queried_when_a_process_appears_and_every_five_seconds_until_the_controllers_are_received(
+def test_states_are_queried_when_a_process_appears_and_every_five_seconds_until_the_controller_has_sent_its_own(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(monitor.Monitor, "_query", query := Mock())

@@ -343,9 +343,8 @@ def test_in_open_loop_the_command_holds() -> None:
 def test_a_loaded_calibration_does_not_make_the_mirror_jump(noll: tuple[int, ...]) -> None:
     before = running()
     state, (outputs,) = feed(DEFAULTS, before, Load(0, calibration(noll, scale=2.0), "another"))
-    adoption = (
-        [] if noll == NOLL else ["SHAPE_ADOPTED"]
-    )  # the part of the shape outside the new modes becomes a channel
+    # The part of the shape outside the new modes becomes a channel.
+    adoption = [] if noll == NOLL else ["SHAPE_ADOPTED"]
     assert names([outputs]) == ["CALIBRATION_LOADED", *adoption]
     assert np.array_equal(state.loop.actuators_nm, before.loop.actuators_nm)
     _, (outputs,) = feed(DEFAULTS, state, Tick(0, 0))

@@ -17,7 +17,7 @@ from tests.support.loops import until
 NOTE = 'printf "%s\\n" "$LOWFC_RUN|$LOWFC_LEVEL|$LOWFC_PROCESS|$LOWFC_EVENT|$LOWFC_TEXT|$LOWFC_OTHERS" >> notes; '
 
 
-class Bench:
+class AlarmBench:
     """A camera that publishes events, and a recorder with an alarm."""
 
     def __init__(self, command: str, min_interval_s: float = 0.0) -> None:
@@ -31,7 +31,7 @@ class Bench:
 
 def test_events_while_the_command_runs_cause_one_more_run_for_the_most_severe(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    run = Bench(NOTE + "until test -e go; do sleep 0.01; done")
+    run = AlarmBench(NOTE + "until test -e go; do sleep 0.01; done")
     run.camera.event("MIRROR_BACK")
     run.camera.event("MIRROR_REFUSED", why="it is\n`touch harm`")
     notes = Path("notes")
@@ -59,7 +59,7 @@ def real_time() -> None:
 def test_the_command_leaves_the_real_time_class_and_runs_at_most_once_per_interval(tmp_path: Path) -> None:
     notes = tmp_path / "notes"  # absolute: by the second run another test may have changed the working directory
     with ThreadPoolExecutor(1, initializer=real_time) as recorder:
-        run = recorder.submit(Bench, f"chrt -p $$ >> {notes}; nice >> {notes}", min_interval_s=60.0).result()
+        run = recorder.submit(AlarmBench, f"chrt -p $$ >> {notes}; nice >> {notes}", min_interval_s=60.0).result()
         permitted = recorder.submit(os.sched_getscheduler, 0).result() == os.SCHED_RR
     run.camera.event("CAMERA_RESTARTED")
     until(lambda: notes.exists() and len(notes.read_text().splitlines()) == 3)
@@ -76,7 +76,7 @@ def test_the_command_leaves_the_real_time_class_and_runs_at_most_once_per_interv
 
 def test_a_command_that_fails_or_hangs_raises_an_event_that_does_not_run_it_again(monkeypatch) -> None:
     monkeypatch.setattr(alarms, "TIMEOUT_S", 0.2)
-    run = Bench("if test $LOWFC_EVENT = MIRROR_LOST; then sleep 100; fi; exit 3")
+    run = AlarmBench("if test $LOWFC_EVENT = MIRROR_LOST; then sleep 100; fi; exit 3")
     run.camera.event("CAMERA_RESTARTED")
     until(run.failures)
     run.camera.event("MIRROR_LOST", fault="is silent")

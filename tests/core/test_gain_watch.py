@@ -15,7 +15,7 @@ from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.map_reconstructor import map_rows, noise_covariance_nm2
 from lowfc.control.laws.automatic_gain import FRAMES_PER_SUM, GainBank, TiltCrossTalk
-from lowfc.control.laws.integrator import MAX_KEPT, TIP_TILT
+from lowfc.control.laws.integrator import MAX_KEPT_UNCORRECTED, TIP_TILT
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Input, Load, Request
@@ -180,7 +180,7 @@ def test_the_command_of_a_mode_with_automatic_gain_zero_relaxes_to_zero() -> Non
     loop.run(99)
     after_nm = loop.steps[-1].command_nm
     assert np.abs(before_nm[5:]).max() > 0.1
-    np.testing.assert_allclose(after_nm[5:], before_nm[5:] * MAX_KEPT**99, atol=1e-3)
+    np.testing.assert_allclose(after_nm[5:], before_nm[5:] * MAX_KEPT_UNCORRECTED**99, atol=1e-3)
     assert after_nm[2] == before_nm[2] != 0
 
 

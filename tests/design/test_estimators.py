@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lowfc.design.estimators import KINDS, estimate, fit, iterated
-from lowfc.design.fisher import covariance, cramer_rao, variance_e
+from lowfc.design.fisher import covariance, cramer_rao, variance_e2
 from lowfc.design.trials import (
     bounds_waves,
     expected_rms,
@@ -51,7 +51,7 @@ def test_indistinguishable_modes_are_refused():
 
 
 def test_weighted_estimator_attains_the_cramer_rao_bound(fits):
-    variance = variance_e(fits["pinv"].reference_e, READ_NOISE_E)
+    variance = variance_e2(fits["pinv"].reference_e, READ_NOISE_E)
     bound = cramer_rao(fits["pinv"].response_e, variance)
     np.testing.assert_allclose(covariance(fits["weighted"].R, variance), bound, rtol=1e-9)
     assert (np.diag(covariance(fits["pinv"].R, variance)) > 1.05 * np.diag(bound)).all()
@@ -95,7 +95,7 @@ def test_iterations_with_the_full_model_remove_the_second_order_error(fits, opti
 def test_scatter_of_estimates_from_noisy_images_agrees_with_the_prediction(fits, kind):
     rng, linear, count = np.random.default_rng(5), fits[kind], 20_000
     images_e = noisy_e(rng, np.tile(linear.reference_e, (count, 1)), READ_NOISE_E)
-    predicted = np.sqrt(np.diag(covariance(linear.R, variance_e(linear.reference_e, READ_NOISE_E) + 1 / 12)))
+    predicted = np.sqrt(np.diag(covariance(linear.R, variance_e2(linear.reference_e, READ_NOISE_E) + 1 / 12)))
     measured = estimate(linear, images_e).std(axis=0, ddof=1)
     np.testing.assert_allclose(measured, predicted, rtol=4 / np.sqrt(2 * count))
 

@@ -10,7 +10,7 @@ from lowfc.adapters.files.sensors import sensor_from, sensor_named
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.sections import SensorSection
-from lowfc.design.fisher import cramer_rao, quantum_information, variance_e
+from lowfc.design.fisher import cramer_rao, quantum_information, variance_e2
 from lowfc.design.full_light import FocalLight, FullLight, sweep
 from lowfc.design.goal import Goal, merit, predictions
 from lowfc.design.merit import contrast_noise
@@ -57,7 +57,7 @@ def modes():
 def test_cramer_rao_bound_exceeds_the_quantum_limit(name, modes):
     sensor = sensor_named(name)
     I0, H = reference(sensor).ravel() * LIGHT_E, response(sensor, modes[:14]) * LIGHT_E
-    bound = cramer_rao(H, variance_e(I0, 0.0))
+    bound = cramer_rao(H, variance_e2(I0, 0.0))
     limit = np.linalg.inv(quantum_information(sensor.pupil, modes[:14], 550.0, LIGHT_E))
     assert np.linalg.eigvalsh(bound - limit).min() > 0
     noise_nm, ratio = EXPECTED[name]
@@ -84,7 +84,7 @@ def test_prediction_of_a_candidate_agrees_with_the_full_chain(name, focal_light,
     central = candidate.central()
     assert np.allclose(central.I0, reference(sensor).ravel(), rtol=1e-9, atol=1e-15)
     assert np.allclose(central.H[:, 7], response(sensor, modes[7:8])[:, 0], rtol=1e-9, atol=1e-15)
-    bound = cramer_rao(central.H[:, :14] * LIGHT_E, variance_e(central.I0 * LIGHT_E, 1.0))
+    bound = cramer_rao(central.H[:, :14] * LIGHT_E, variance_e2(central.I0 * LIGHT_E, 1.0))
     expected = np.sum(contrast_form(Coronagraph(sensor.pupil), NOLLS_14, 550.0) * bound)
     assert contrast_noise(candidate.forms, central, "weighted") == pytest.approx(expected, rel=0.01)
     assert merit(candidate, Goal("contrast", "weighted")) == contrast_noise(candidate.forms, central, "weighted")

@@ -339,7 +339,7 @@ def test_a_forged_command_with_the_controllers_certificate_reaches_the_mirror(be
 
 
 def test_a_forger_receives_no_message_and_no_answer_and_moves_no_mirror(bench: Bench, tmp_path: Path) -> None:
-    """The certificates of the forgers: of another role, of an unknown role, of a foreign authority; two have none."""
+    """A forger has a certificate of another role, of no known role or of a foreign authority, or none, or no TLS."""
     camera, desk = bench.lab["camera"], bench.lab["desk"]
     make_certificates(bench.authority, ["stranger"], [])
     make_certificates(tmp_path, ROLES, [])

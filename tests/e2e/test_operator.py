@@ -272,7 +272,9 @@ def test_the_night_is_replayed_to_the_bit(night: Night) -> None:
         commands += results["commands"]
     frames = night.results["frames_processed"]
     assert isinstance(frames, int)
-    assert commands > 0.6 * frames, "only the commands before the first controller state of a log are not replayed"
+    assert commands > 0.6 * frames, (
+        "only the commands before the first controller state of a later log are not replayed"
+    )
 
 
 @pytest.mark.slow

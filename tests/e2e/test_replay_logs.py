@@ -66,9 +66,9 @@ class Night:
         health = self.loop.processes().get(name)
         return health is not None and health.state in ("ready", "running")
 
-    def end(self, name: str, number: signal.Signals = signal.SIGTERM) -> None:
+    def end(self, name: str, signal_: signal.Signals = signal.SIGTERM) -> None:
         process = self.running.pop(name)
-        process.send_signal(number)
+        process.send_signal(signal_)
         process.wait(20)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Readers of external bytes, with damaged inputs: each raises only its declared errors, and does not hang or leak."""
+"""Readers of external bytes, with damaged inputs: each raises declared errors only, without a crash, hang or leak."""
 
 from contextlib import suppress
 

@@ -1,4 +1,4 @@
-"""Required documentation: public names of five packages, shapes and units of array arguments, advice on events."""
+"""Required documentation: public names of five packages, valid markup, shapes and units of arrays, advice on events."""
 
 import ast
 import io
@@ -6,12 +6,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import docutils.nodes
 import pytest
-from docutils.frontend import get_default_settings
-from docutils.parsers.rst import Parser
-from docutils.utils import new_document
-from sphinx.ext.napoleon import Config, GoogleDocstring
 
 from lowfc.contract.events import EVENTS
 from lowfc.contract.wire import lowfc_pb2
@@ -58,6 +53,12 @@ def test_every_public_name_has_a_docstring(package: str) -> None:
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_docstrings_are_valid_markup(package: str) -> None:
+    import docutils.nodes
+    from docutils.frontend import get_default_settings
+    from docutils.parsers.rst import Parser
+    from docutils.utils import new_document
+    from sphinx.ext.napoleon import Config, GoogleDocstring
+
     settings = get_default_settings(Parser)
     settings.warning_stream = io.StringIO()
     for name, _, text, _ in definitions(package):

@@ -385,9 +385,8 @@ def test_a_real_run_of_an_implementation_gives_its_latencies(chosen: implementat
     if why := implementations.missing(chosen, options):
         pytest.skip(why)
     found = comparison.one_run(chosen, options, 0)
-    assert found["frames"] == pytest.approx(
-        seconds * rate_hz, abs=10
-    )  # lowfc's warm-up is a time, not a number of frames
+    # The warm-up of lowfc is a time, not a number of frames.
+    assert found["frames"] == pytest.approx(seconds * rate_hz, abs=10)
     assert found["without_command"] < found["frames"]
     to_command, to_mirror = found["frame_to_command"], found["frame_to_mirror"]
     assert 0 < to_command["p50"] <= to_command["p99"] <= to_command["max"]

@@ -173,7 +173,7 @@ def test_mirror_on_the_nodes_gives_the_commanded_wavefront(sensor, fast):
     commands = modes_to_actuators(Mirror(), NOLLS_20)
     for command, mode in zip(commands.T, zernikes(NOLLS_20, *node_radii(fast)), strict=True):
         error = wavefront_nm(on_nodes, 10.0 * command.reshape(34, 34)) - 10.0 * mode
-        assert wavefront_rms_nm(fast, error) < 0.35  # of which the fit by influence functions leaves 0.16 nm
+        assert wavefront_rms_nm(fast, error) < 0.35  # of which the fit by influence functions leaves up to 0.16 nm
     pokes_nm = poke_wavefronts_nm(on_nodes) @ commands
     for command, wavefront in zip(commands.T, pokes_nm.T, strict=True):
         np.testing.assert_allclose(wavefront, wavefront_nm(on_nodes, command.reshape(34, 34)), atol=1e-5)

@@ -64,9 +64,8 @@ def few():
         tables = run(
             ("table1", "table2", "table3", "table4", "photometry"), Context(FEW_TRIALS, jobs=2, sensors=(SAM,))
         )
-        tables += run(
-            ["conditioning"], Context(FEW_TRIALS, jobs=2, sensors=("zwfs",))
-        )  # bar and holes are aperture masks
+        # Bar and holes are aperture masks.
+        tables += run(["conditioning"], Context(FEW_TRIALS, jobs=2, sensors=("zwfs",)))
     return {table["table"]: table for table in tables}
 
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from lowfc.design.fisher import cramer_rao, variance_e
+from lowfc.design.fisher import cramer_rao, variance_e2
 from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.detector.photometry import electrons
@@ -85,12 +85,12 @@ def test_correction_restores_the_contrast(tables):
 
 
 def test_the_contrast_of_a_lyot_coronagraph_is_that_behind_its_stop():
-    ready = prepared("aplc")
-    flat = aberration._contrast(ready, np.zeros(14))
+    sensor = prepared("aplc")
+    flat = aberration._contrast(sensor, np.zeros(14))
     assert flat < 1e-10
-    curve = aberration._curve(ready, np.zeros(14))
+    curve = aberration._curve(sensor, np.zeros(14))
     assert curve[9] == pytest.approx(flat, rel=0.3)  # 4.75 to 5.25 lambda/D
-    assert aberration._between_samples(ready)[0].measured < 1e-8
+    assert aberration._between_samples(sensor)[0].measured < 1e-8
 
 
 def test_masks_and_throughputs_are_those_of_the_sensors(tables):
@@ -144,20 +144,20 @@ def test_correction_of_screens_approaches_the_best_fit_of_fourteen_modes(tables)
 
 def test_the_signal_of_a_milliarcsecond_agrees_with_the_slope_of_the_image(tables):
     rows = tables["fig10"]
-    ready = prepared("sam")
+    sensor = prepared("sam")
     u = 2 * pupil_axis(512)
-    tilt_nm = 1e-3 / 3600 * np.pi / 180 * 2.0 / 4 * 1e9 * 2 * np.broadcast_to(u, (512, 512))  # diameter 2 m
-    np.testing.assert_allclose(ready.opd_nm(np.array([NM_PER_MAS, 0.0])), tilt_nm, atol=1e-3)
-    slope = ready.band_tilt_H[:, 0] * NM_PER_MAS / ready.band_I0.max()
+    tilt_nm = 1e-3 / 3600 * np.pi / 180 * 2.0 / 4 * 1e9 * 2 * np.broadcast_to(u, (512, 512))  # diameter 2 m; Z2 = 2 u
+    np.testing.assert_allclose(sensor.opd_nm(np.array([NM_PER_MAS, 0.0])), tilt_nm, atol=1e-3)
+    slope = sensor.band_tilt_H[:, 0] * NM_PER_MAS / sensor.band_I0.max()
     assert values(rows, "P-V change of the image / its peak", name="sam, tilt x")[0] == pytest.approx(
         np.ptp(slope), rel=0.02
     )
 
 
 def test_the_signal_to_noise_ratio_of_an_image_agrees_with_the_bound_of_tilt(tables):
-    rows, ready = tables["fig10"], prepared("sam")
+    rows, sensor = tables["fig10"], prepared("sam")
     light_e = electrons(STAR, TABLE4_EXPOSURE_S)
-    slope_e, noise_e2 = light_e * NM_PER_MAS * ready.band_tilt_H[:, 1:2], variance_e(light_e * ready.band_I0, 1.0)
+    slope_e, noise_e2 = light_e * NM_PER_MAS * sensor.band_tilt_H[:, 1:2], variance_e2(light_e * sensor.band_I0, 1.0)
     least_mas = np.sqrt(cramer_rao(slope_e, noise_e2)[0, 0])
     ratio = values(rows, "signal-to-noise ratio of the image", name="sam, tilt y")[0]
     assert ratio == pytest.approx(1.0 / least_mas, rel=0.03)

@@ -349,7 +349,7 @@ def test_the_reason_why_a_command_fails_is_given() -> None:
 
 
 def test_a_shifted_clock_is_tried_with_the_shift_of_the_case(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The kernel refuses a monotonic clock below zero: a clock an hour behind needs a host that is up for an hour."""
+    """The kernel refuses a monotonic clock below zero: a clock an hour behind needs a host that was up so long."""
     monkeypatch.setattr("lowfc.programs.reliability.chaos.case.unmet", lambda *arguments: " ".join(arguments[-2:]))
     assert [CASES[f"clock-{kind}"].why_skipped() for kind in ("ahead", "behind")] == ["3600 true", "-3600 true"]
 

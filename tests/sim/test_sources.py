@@ -100,7 +100,7 @@ def test_two_wheels_beat() -> None:
     # Expected in the middle of each tenth of a second; 900 / 925 is the amplitude at 30 Hz relative to high speed.
     expected = 4 * np.abs(np.cos(np.pi * 0.5 * (0.05 + 0.1 * np.arange(40)))) * 900 / 925
     np.testing.assert_allclose(envelope, expected, atol=0.4)
-    config = quiet(disturbance__wheel_hz=30.0, disturbance__second_wheel_hz=0.5)
+    config = quiet(disturbance__wheel_hz=30.0, disturbance__second_wheel_hz=0.5)  # relative to the first wheel
     assert [each.start_hz for each in disturbance_of(config).wheels] == [30.0, 30.5]
 
 
@@ -127,13 +127,13 @@ def test_shear_changes_the_image_but_not_the_wavefront() -> None:
     assert series.std(axis=0) == pytest.approx([0.002, 0.002], rel=0.2)
     index = 1000 * int(np.abs(series[::100]).max(axis=1).argmax())  # a frame with large shear
     truth = sheared.truth(index, FLAT)
-    # Half of each period is exposed; the shear is that of the middle.
+    # Half of each period is exposed; the shear is that of the exposure's middle.
     np.testing.assert_allclose(truth.shear, shear_at(disturbance, (index + 0.25) / 1000))
     assert truth.sampled.residual_rms_nm == pytest.approx(0, abs=1e-4)
     changed = sheared.expose(index, FLAT).astype(float) - scene(quiet(**keys)).expose(index, FLAT)
     slopes = shear_slopes(config) @ truth.shear
-    electrons = (sheared.expose(index, FLAT).sum() - 100 * 6400) / reference(twin(config, None, print)).sum()
-    np.testing.assert_allclose(changed.ravel(), electrons * slopes, atol=1.5)
+    light_dn = (sheared.expose(index, FLAT).sum() - 100 * 6400) / reference(twin(config, None, print)).sum()
+    np.testing.assert_allclose(changed.ravel(), light_dn * slopes, atol=1.5)
     assert np.abs(changed).max() > 25
 
 

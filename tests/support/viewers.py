@@ -1,4 +1,4 @@
-"""Helpers for tests of viewers: rerun's own, and its page in a real browser."""
+"""Helpers for tests of rerun's native viewer, and of its web viewer in a real browser."""
 
 import base64
 import contextlib
@@ -77,7 +77,7 @@ class Page:
     """A page of a headless Chromium, controlled by its debugging protocol.
 
     Attributes:
-        fetched: addresses requested by the page, by request id, without those blocked by its policy.
+        fetched: addresses requested by the page, by request id, without those blocked by its Content-Security-Policy.
         complaints: errors and warnings of its console.
     """
 
@@ -131,7 +131,7 @@ class Page:
 
 @contextlib.contextmanager
 def browser(folder: Path, size_px: tuple[int, int], *, webgl: bool = False) -> Iterator[Page]:
-    """Run a headless Chromium with its own profile, connected to this host only; with `webgl`, it draws in software."""
+    """Run a headless Chromium that reaches this host only; with `webgl` it draws in software, which is slow."""
     quiet = ("quic", "background-networking", "component-update", "sync", "default-apps", "extensions", "dev-shm-usage")
     options = ["headless", "no-sandbox", "no-first-run", "hide-scrollbars", "remote-debugging-port=0"]
     drawing = ("use-angle=swiftshader", "enable-unsafe-swiftshader", "ignore-gpu-blocklist")

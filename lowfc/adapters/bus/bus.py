@@ -152,7 +152,7 @@ class Faults:
         self._lock = threading.Lock()
 
     def add(self, place: str, key: str, fault: Exception) -> None:
-        """Count an unreadable message, or another fault at a place such as "camera: handler of" and a topic's key."""
+        """Count an unreadable message of topic `key`, or another fault at `place`, such as "camera: handler of"."""
         if isinstance(fault, UNREADABLE):
             self.add_unreadable(key, fault)
             return

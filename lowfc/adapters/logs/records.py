@@ -37,9 +37,8 @@ _CHANGED = "its parts are intact, but some are missing or out of order, or bytes
 _BEGIN = MAGIC + bytes([Opcode.HEADER])
 _OF_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
 _FIRST_BLOCK_BYTES = 1 << 12
-_TRIES = (
-    4  # candidates for chunks are read up to this many times the file's size: no file may occupy the search for long
-)
+_TRIES = 4
+"""Candidates for chunks are read up to this many times the file's size: no file may occupy the search for long."""
 
 
 @dataclass(slots=True)

@@ -35,7 +35,7 @@ def thin(
         return topic is None or combined.keeps(topic, message.sequence, message.payload)
 
     def include_record(record: Metadata | Attachment) -> bool:
-        """Whether to copy a record: the first of a name, but all "recording" and "recovery", whose last readers use."""
+        """Whether to copy a record: the first of a name; all "recording" and "recovery", as readers use the last."""
         excluded = record.name in excluded_names and record.name not in ("recording", RECOVERY)
         excluded_names.add(record.name)
         return not excluded

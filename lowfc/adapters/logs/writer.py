@@ -1,8 +1,8 @@
 """Writing logs: self-describing MCAP files that lose at most the last fraction of a second in a crash.
 
-A log is written as `<name>.mcap.part` and renamed when it is finished. Its metadata and attachments are at its start.
-A channel is one topic from one start of its publisher: MCAP's 32-bit sequence is the count, the channel's metadata
-contain the start.
+A log is written as `<name>.mcap.part` and renamed when it is finished. Its attachments and first metadata are at its
+start, its totals at its end. A channel is one topic from one start of its publisher: MCAP's 32-bit sequence is the
+publisher's count of messages, and the channel's metadata contain the start.
 
 Flushed data survive any death of the process, but not a loss of power: only a finished log with its final name is known
 to be on the disk.
@@ -40,7 +40,9 @@ UNFINISHED = ".part"
 FILE_MODE = 0o640
 """Default permissions of a log, further reduced by the umask: notes and frames are not public."""
 
-CHUNK_BYTES = 240 * 1024  # the message that exceeds this ends the chunk, which stays below 256 KiB with 15-KiB frames
+CHUNK_BYTES = (
+    240 * 1024
+)  # the message that exceeds this ends the chunk, which stays below 256 KiB if frames have up to 15
 PART = "part"
 """Name of the metadata with the recording that a file belongs to, and the file's number in it."""
 

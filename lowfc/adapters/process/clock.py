@@ -15,7 +15,7 @@ SIMULATED_START_NS = 1_767_225_600_000_000_000
 """2026-01-01T00:00:00Z, the start of every lockstep run."""
 
 WALL_TOLERANCE_NS = 100_000_000
-"""Difference from the wall clock that an event reports: the wall clock was set since the offset was stored."""
+"""Largest difference from the wall clock without an event; beyond it the wall clock was set after the offset."""
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _NS = 1_000_000_000

@@ -56,7 +56,7 @@ def set_up(priority: int | None, cpus: set[int] | None, *, lock_memory: bool, di
     gc.collect()
     gc.freeze()
     gc.disable()
-    measures = _processors(cpus, "the kernel moves the loop between processors; expect a longer tail")
+    measures = _processors(cpus, "the kernel moves the loop between processors; expect a longer tail of the latencies")
     if lock_memory:
         cost = "a page that was swapped out stalls the loop for milliseconds"
         measures.append(("locked memory", _lock_memory, cost))
@@ -129,9 +129,8 @@ def yield_to_sender() -> None:
     """Yield so that the bus's thread sends the last put before this thread continues.
 
     With equal SCHED_FIFO priority on the same processor, the bus's thread would wait until this one sleeps. A mirror's
-    process on this processor (if there are only two) would wait in the same way: the second yield lets it apply the
-    command. In the normal class the kernel schedules these threads, and
-    yielding would let any process run.
+    process on this processor (with only two processors) would wait in the same way: the second yield lets it apply the
+    command. In the normal class the kernel schedules these threads, and yielding would let any process run.
     """
     if os.sched_getscheduler(0) == os.SCHED_FIFO:
         os.sched_yield()

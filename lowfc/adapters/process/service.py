@@ -231,7 +231,7 @@ class Service:
             self._send_health(now_ns)
 
     def finish(self) -> None:
-        """Publish a final Health, with all counts, as the last message; if a handler failed, raise its exception."""
+        """Publish a final Health, with all counts, as the last message, or raise the exception of a failed handler."""
         if self._fault is not None:
             raise self._fault
         self._report_unreadable()

@@ -1,7 +1,4 @@
-"""Change the dark, the pixel mask or the reference image of a calibration, and adapt I0, H and R to the change.
-
-`actuators_to_modes` is not adapted.
-"""
+"""Change the dark, the pixels or the reference image of a calibration, and adapt all but `actuators_to_modes`."""
 
 from dataclasses import replace
 

@@ -115,7 +115,7 @@ def seen_rows(table: Array, weights: Array, sequence: npt.NDArray[np.integer], c
 
 
 def usable_exposures(plan: Plan, sequence: npt.NDArray[np.integer], commanded: Mask, lag: int) -> Mask:
-    """Whether each exposure (exposures,) sees a usable row, and every frame from the one before led to a command.
+    """Whether each exposure (exposures,) sees a usable row, with a command from each frame that acts on it.
 
     Args:
         plan: The plan that was played.

@@ -1,4 +1,4 @@
-"""From modal errors to the next command: the reference in numpy, and the fused step for normal frames."""
+"""From measured modes to the next command: the reference in numpy, and the fused step for normal frames."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ def respond(
     events: list[PendingEvent],
     tables: Tables | None,
 ) -> tuple[Single, Single, ActiveLoop, tuple[Reason, ...], bool]:
-    """Respond to the modal errors (modes,) of a frame; `tables` is not None if the fused step computed the errors.
+    """Respond to the modes R (I - I0) (modes,) of a frame; `tables` is None unless the fused step measured them.
 
     Returns:
         Error and pseudo-open-loop modes (modes,), nm of wavefront rms; the loop after the frame; the limits that acted
@@ -116,7 +116,7 @@ def _update_guard(
             guard = guard.at_rest()
         elif advanced.frames <= SETTLING_FRAMES or not closed:
             guard = guard.observed(pol_from_target_nm, advanced.frames)
-        else:  # a modal limit does not void the comparison, as virtual commands are limited in the same way
+        else:  # a modal limit does not void the comparison, as the guard's commands are limited in the same way
             limited = any(reason is not Limit.MODAL_LIMIT for reason in state.limits_hit)
             commands = advanced.law, advanced.x, loop.integrator, loop.delay_weights, loop.history_nm
             guard, guard_events = guard.judged(*commands, error_nm, pol_from_target_nm, limited=limited)
@@ -133,7 +133,7 @@ def next_command(
         return step_to_flat(settings, loop), (), False
     channels, returning_to_zero = loop.command_channels, state.returning_to_zero
     closed = state.mode is LoopMode.CLOSED
-    # If a limit changed the last command, the mirror lacks a part of the channels, even if all count as reached.
+    # If a limit changed the last command, the mirror lacks a part of the channels, even if all are recorded as reached.
     channels_move = channels is not None and bool(channels.moving or state.limits_hit)
     if not (state.may_command and (closed or returning_to_zero or channels_move)):
         return loop.holding_command(1), (), returning_to_zero

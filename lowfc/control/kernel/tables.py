@@ -34,7 +34,7 @@ NUMPY = Kernel("numpy")
 
 
 class Estimate(NamedTuple):
-    """Modal errors of a frame (modes,), nm of wavefront rms, and the sum of its good pixels, dark subtracted, DN."""
+    """R (I - I0) (modes,) of a frame, nm of wavefront rms, and the sum of its good pixels, dark subtracted, DN."""
 
     error_nm: Single
     flux_dn: float

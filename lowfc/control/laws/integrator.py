@@ -8,7 +8,7 @@ from lowfc.arrays import Mask, Single, single
 
 TIP_TILT = (2, 3)
 """Noll indices of tip and tilt, whose gains are set and judged separately from those of the other modes."""
-MAX_KEPT = np.float32(0.99)
+MAX_KEPT_UNCORRECTED = np.float32(0.99)
 """Largest fraction of its command that a mode keeps from frame to frame while its automatic gain is 0: without a gain,
 nothing else removes what an earlier gain put on the mirror."""
 
@@ -19,7 +19,7 @@ class Integrator:
 
     Attributes:
         uncorrected: (modes,) whether a mode is uncorrected because its automatic gain is 0.
-        kept: (modes,) fraction of the command that is kept: 1 - leak, at most `MAX_KEPT` for an uncorrected mode.
+        kept: (modes,) fraction of the command that is kept: 1 - leak; uncorrected modes at most `MAX_KEPT_UNCORRECTED`.
         rows: (3, modes) gain, kept and limit.
     """
 
@@ -44,7 +44,9 @@ class Integrator:
             if not (np.isfinite(array).all() and (array >= low).all() and (array <= high).all()):
                 expected = f"between {low} and {high}" if np.isfinite(high) else f"finite and at least {low}"
                 raise ValueError(f"every {name} must be {expected}, got {array.tolist()}")
-        object.__setattr__(self, "kept", np.where(self.uncorrected, np.minimum(1 - self.leak, MAX_KEPT), 1 - self.leak))
+        object.__setattr__(
+            self, "kept", np.where(self.uncorrected, np.minimum(1 - self.leak, MAX_KEPT_UNCORRECTED), 1 - self.leak)
+        )
         object.__setattr__(self, "rows", single([self.gain, self.kept, self.limit_nm]))
 
 

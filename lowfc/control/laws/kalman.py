@@ -63,5 +63,5 @@ def covariance_nm2(model: Model) -> Array:
         if np.abs(grown).max() <= 1e-12 * np.abs(X).max():
             return model.noise_nm2 * np.asarray(X)
     raise ValueError(
-        f"no Kalman filter settles within {2**_DOUBLINGS} frames: drift or lines are far below the noise, or it is zero"
+        f"no Kalman filter settles within {2**_DOUBLINGS} frames: drift or lines far below the noise, or zero noise"
     )

@@ -109,10 +109,10 @@ def time_series(sequence: Sequences, values: npt.NDArray[np.floating]) -> TimeSe
 
 
 def spectrum(series: TimeSeries, rate_hz: float, frames: int = 0) -> Spectrum | None:
-    """Welch's estimate over all pieces with at least a segment; None if there are none.
+    """Welch's estimate over all pieces of at least a segment's length; None if there are none.
 
     Each segment's mean is subtracted, and Hann's window applied. A segment has `frames` frames or, if this is 0, a
-    power of two that follows from the longest piece. `scipy.signal.welch` is not used: its import takes half a second.
+    power of two that follows from the longest piece. As `scipy.signal.welch`, whose import takes half a second.
     """
     if series.longest < SHORTEST:
         return None

@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 MIN_TOLERANCE_DN = 1.0
 """Change of bias or saturation that is always tolerated, DN."""
 GAIN_TOLERANCE = 0.01
-"""Relative change of a gain that is tolerated: gains are settings, not measurements."""
+"""Relative change of a gain that is tolerated; small, as gains are settings, without measurement noise."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """Camera settings, as far as a calibration depends on them.
+    """Camera settings: those that a calibration depends on, and their time.
 
     Attributes:
         time_ns: when they were published; ignored by `==`.

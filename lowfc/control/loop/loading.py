@@ -207,7 +207,7 @@ def mirror_shape_reported(settings: Settings, state: State, shape: MirrorShape) 
 
 
 def mirror_fault_reported(settings: Settings, state: State, report: MirrorReport) -> tuple[State, Outputs]:
-    """Hold the command while the mirror does not follow; a closed loop returns to its last shape, against wind-up.
+    """Hold the command while the mirror does not follow; a closed loop returns to the mirror's last shape.
 
     A return of more than the slew limit takes several reports.
     """

@@ -1,7 +1,7 @@
 """Limits of the mirror, changes of the loop mode and the command timeout, independent of control law and estimate.
 
-The controller applies them to the commands that it sends, and the mirror again to the commands that it receives;
-`docs/explanation/safety.md` lists the hazards.
+The controller applies the limits to the commands that it sends, and the mirror again to the commands that it receives.
+The controller changes the mode, the mirror applies the timeout; `docs/explanation/safety.md` lists the hazards.
 """
 
 from dataclasses import dataclass, field
@@ -37,7 +37,7 @@ class LoopMode(IntEnum):
 
 
 class Rejection(IntEnum):
-    """Why a frame was not used; numbered as on the wire."""
+    """Why a frame or a command was refused, or a frame is missing; numbered as on the wire."""
 
     NO_CALIBRATION = 1
     WRONG_SIZE = 2
@@ -98,8 +98,8 @@ class Limits:
         stroke_nm: largest deviation of an actuator from flat, in either direction.
         slew_nm: largest change of an actuator from one command to the next.
         neighbour_nm: largest difference between actuators side by side.
-        margin_nm: distance kept from stroke and slew limit, half of it from the neighbour limit: 1e-3 nm, or sixteen
-            roundings of float32 for a long stroke.
+        margin_nm: distance kept from stroke and slew limit, half of it from the neighbour limit: 1e-3 nm, or 16
+            spacings of float32 numbers at a long stroke.
         kept_stroke_nm: stroke minus the margin, a float32, so that a command clipped to it is not clipped again.
         kept_slew_nm: slew minus the margin, also a float32.
     """
@@ -165,9 +165,10 @@ def limit(limits: Limits, previous_nm: Single, requested_nm: Single) -> Limited:
 
 
 def _shorten(limits: Limits, previous_nm: Single, kept_nm: Single) -> Single:
-    """Go from `previous_nm` towards `kept_nm` as far as neighbours allow; shrink `previous_nm` if it exceeds a limit.
+    """Go from `previous_nm` towards `kept_nm` as far as neighbours allow; first shrink a `previous_nm` at a limit.
 
-    The result is half a margin further inside than `limit` requires, so that rounding does not block the mirror there.
+    The result is half a margin further below the neighbour limit than `limit` requires: rounding could block a mirror
+    that is exactly at it.
     """
     margin_nm = limits.margin_nm
     neighbour_nm = limits.neighbour_nm - margin_nm

@@ -1,15 +1,15 @@
-"""Phrases and formats shared by several messages, and the longest note."""
+"""Phrases and formats shared by several messages, and the largest length of a note."""
 
 PAUSED = "operator asked to pause"
 """Cause of the open mode of a loop that is paused."""
 AUTO = "auto"
-"""Text of a request for automatic gains, and beginning of the text of the requests that automatic gains send."""
+"""Text of a request for automatic gains; it also begins the requests that the controller makes for them itself."""
 MEASURED_FIRST = "the gains are measured before the loop closes"
 """Cause of the open mode in which a loop with automatic gains begins."""
 CAMERA_MISFIT = "the camera does not fit the calibration"
 """Beginning of the cause if the loop is open because the camera's settings differ from the calibration's."""
 MAX_NOTE_LENGTH = 10_000
-"""Most characters of a note."""
+"""Largest number of characters of a note in the log."""
 
 
 def counted(count: float, noun: str, plural: str = "") -> str:

@@ -19,9 +19,9 @@ class ScienceCamera:
     """Contrast of a coronagraph, in single precision, from modal wavefronts.
 
     The field is summed over the open cells of the pupil only: the wavefront is evaluated at each cell's centre, and the
-    Fourier kernel is summed over the cell's samples. Cells have 2 x 2 samples if the pupil is constant within
-    each, as in the package's shaped pupil, otherwise one sample. For a Lyot coronagraph cells have 4 x 4
-    samples, over which the pupil is averaged.
+    Fourier kernel is summed over the cell's samples. Cells have 2 x 2 samples if the pupil is constant within each, as
+    in the package's shaped pupil, otherwise one sample. For a Lyot coronagraph cells have 4 x 4 samples, over which the
+    pupil is averaged.
 
     Attributes:
         samples: Samples across the square image, at the positions of `grid.image_axis`.

@@ -50,8 +50,8 @@ def build(
     points, to_pixels = _intensity_sampling(sensor, spec, max(scales))
     area = np.count_nonzero(mask) / sensor.samples_per**2
     # Two thirds of the modes are degrees of freedom of the light, proportional to the mask's area; a third is for the
-    # mask's edge. An aperture mask blurs the contribution of the faintest modes; without one, a third more is needed.
-    # A pupil that is bright up to its edge excites the faintest modes and needs a tenth more.
+    # mask's edge. An aperture mask blurs the contribution of the faintest modes; without one, a third more modes are
+    # needed. A pupil that is bright up to its edge excites the faintest modes and needs a tenth more.
     needed = spec.rank if isinstance(sensor.relay, ApertureMask) else 4 * spec.rank / 3
     if sensor.pupil.mean() > 0.5:
         needed *= 1.1

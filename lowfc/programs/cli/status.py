@@ -44,9 +44,8 @@ def json_object(
     camera = processes.get(Role.CAMERA, NO_HEALTH)
     simulated = wavefront(camera.recent_wavefront) if camera.HasField("recent_wavefront") else None
     contrast = simulated
-    measured = (
-        controller.HasField("recent_wavefront") and last_second.frames
-    )  # without frames the statistics are out of date
+    # Without frames the statistics are out of date.
+    measured = controller.HasField("recent_wavefront") and last_second.frames
     if measured and (simulated is None or simulated["added_contrast"] is None):
         contrast = wavefront(controller.recent_wavefront)
     return {

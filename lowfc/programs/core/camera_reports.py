@@ -1,4 +1,4 @@
-"""The camera's settings: received when published, and queried until they arrive after a start."""
+"""The camera's settings: received when published, and queried until they arrive after a start of either side."""
 
 import time
 from collections.abc import Callable
@@ -50,7 +50,7 @@ class CameraReports:
         while self._service.running:
             for sample in self._service.bus.get(CAMERA_STATE.key, timeout_s=0.2):
                 # The clock's time, not the camera's: the answer may be the message before the first frame or the one
-                # with it. Their times differ, so that two runs would.
+                # with it. Their times differ, and so would two runs.
                 self.apply(sample, clock.now_ns() if clock.lockstep else None)
                 return
             if clock.host_ns() >= deadline_ns:

@@ -1,4 +1,4 @@
-"""The mirror's first shape, and its faults; these are read from its Health, because all its states would cost time."""
+"""The mirror's first shape, and its faults; these are read from Health, as receiving all states takes time."""
 
 import contextlib
 from collections import deque

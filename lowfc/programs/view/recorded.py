@@ -98,7 +98,7 @@ class _Drawing:
         if topic is MIRROR_STATE:
             with contextlib.suppress(DecodeError):
                 used_nm = stroke_used_nm(wire.MirrorState.FromString(message.payload))
-                self._stroke_nm = max(self._stroke_nm or 0.0, used_nm)
+                self._stroke_nm = used_nm if self._stroke_nm is None else max(self._stroke_nm, used_nm)
         self._last_ns = max(self._last_ns, time_ns)
         if not topic.queryable:  # states queried by the recorder at its start may be hours old
             self._first_ns = self._first_ns or time_ns

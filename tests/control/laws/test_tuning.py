@@ -118,7 +118,7 @@ def test_a_log_with_too_few_frames_in_a_row_is_refused() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("delay", [1.0, 2.0])
 def test_a_law_tuned_in_a_loop_is_nearly_optimal_also_after_lines_have_moved(delay: float) -> None:
-    """It leaves at most 15 % more than in theory and than the best LQG law; a new law for moved lines, 15 % more."""
+    """It leaves at most 1.15 times the theoretical residual and the best LQG law's; a new law 1.15 times that."""
     config = configured(delay_frames=delay)
     calibration = calibrated(config)
     bench = Bench(config, calibration)

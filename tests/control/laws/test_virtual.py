@@ -29,7 +29,7 @@ def test_each_row_has_the_errors_and_commands_of_a_loop_with_its_gain() -> None:
 
 
 def test_differences_of_squared_errors_equal_differences_of_squared_true_residuals() -> None:
-    """Both are averaged over 20,000 frames of a slow drift with stronger noise."""
+    """Both are averaged over 20,000 frames of a slow drift with several times stronger noise."""
     rng = np.random.default_rng(2)
     gain = np.array([0, 0.02, 0.5], np.float32)[:, None] * np.ones((1, 40), np.float32)
     ones = np.ones(40, np.float32)

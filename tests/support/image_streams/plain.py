@@ -27,8 +27,10 @@ def file_of(folder: Path, name: str) -> Path:
 class PlainStream:
     """A mapped stream; positions of its parts are computed from the arguments, never from the header."""
 
-    def __init__(self, path: Path, columns: int, rows: int, type_code: int, planes: int = 1, keywords: int = 0) -> None:
-        self.type, self.shape = np.dtype(NUMPY_TYPES[type_code]), (planes, rows, columns)
+    def __init__(
+        self, path: Path, columns: int, rows: int, pixel_type: int, planes: int = 1, keywords: int = 0
+    ) -> None:
+        self.type, self.shape = np.dtype(NUMPY_TYPES[pixel_type]), (planes, rows, columns)
         self.file = os.open(path, os.O_RDWR)
         self.map = mmap.mmap(self.file, os.fstat(self.file).st_size)
         length = planes * rows * columns * self.type.itemsize
@@ -45,7 +47,7 @@ class PlainStream:
         path: Path,
         columns: int,
         rows: int,
-        type_code: int,
+        pixel_type: int,
         *,
         planes: int = 1,
         version: bytes = b"2.00",
@@ -57,7 +59,7 @@ class PlainStream:
     ) -> Self:
         """Create a stream as the C library does: unlink an existing file; write the version of the layout last."""
         keyword_values = keywords or {}
-        itemsize = np.dtype(NUMPY_TYPES.get(type_code, "f8")).itemsize
+        itemsize = np.dtype(NUMPY_TYPES.get(pixel_type, "f8")).itemsize
         elements = columns * rows * planes
         length = (elements * itemsize + 7) // 8 * 8
         # A circular buffer also has times and a counter of each plane.
@@ -67,10 +69,10 @@ class PlainStream:
             os.fchmod(file.fileno(), 0o666)
             tail = KEYWORD * len(keyword_values) + 11 * SEMAPHORE + 4 * 40 + 10 * TRACE + ring_times
             file.truncate(header_bytes + length + tail)
-        stream = cls(path, columns, rows, type_code if type_code in NUMPY_TYPES else 10, planes, len(keyword_values))
+        stream = cls(path, columns, rows, pixel_type if pixel_type in NUMPY_TYPES else 10, planes, len(keyword_values))
         stream.pack("80s", 32, path.name.removesuffix(".im.shm").encode())
         stream.pack("<B3xIII", 112, axes, columns, rows, planes if axes == 3 else 0)  # number of axes, sizes
-        stream.pack("<QB7xQ", 128, elements, type_code, kind)
+        stream.pack("<QB7xQ", 128, elements, pixel_type, kind)
         stream.pack("<iiB", 216, os.getpid(), 0, 1)  # creator, owner, shared
         stream.pack("<Qb", 232, os.fstat(stream.file).st_ino, location)
         stream.pack("<HH", 258, 10, 10)  # numbers of semaphores and of traces

@@ -256,7 +256,7 @@ def _added_contrast(
 
 
 def _achieved_nm(data: Telemetry, noise_nm: Array) -> Array | None:
-    """Rms (modes,) of the true residual, over all time if known; else of the error less noise; None in open loop."""
+    """Rms (modes,) of the true residual, over all time if known; else of the error without its noise; None if open."""
     if not data.closed:
         return None
     if data.continuous_rms_nm is not None:

@@ -198,7 +198,7 @@ class _System:
             "CLOSED": (closed, "fraction of the steps with the loop closed"),
             "GAINSETS": (
                 sum(one.accepted and one.name in ("gain", "leak") for one in history.requests),
-                "number of accepted requests gain and leak",
+                "number of accepted gain and leak requests",
             ),
         }
         if history.camera is not None:

@@ -34,9 +34,7 @@ def report(
     from lowfc.adapters.logs.parts import named_logs
 
     named = named_logs(logs, out, as_json=as_json)
-    if (
-        out is not None and out.suffix not in _ENDINGS
-    ):  # no other kind of file may be replaced, as a page is without asking
+    if out is not None and out.suffix not in _ENDINGS:  # only HTML files are replaced without asking
         raise DataFileError(f"a report is an HTML page: use --out FILE.html, not {out}")
     for log in named:
         _report(log, out, as_json)

@@ -1,8 +1,8 @@
-"""Stalls of a loop, and their causes from the kernel's counters.
+"""Stalls of a loop, and their causes from the counters of the Linux kernel.
 
 A frame stalls if its command takes longer than a period or is missing. A stall begins when its frame is due. The host
-is its cause if a bare loop on the same processor was also delayed, if the hypervisor stole processor time, or if the
-quota of the control group was used up.
+is its cause if a bare loop (a process that only sleeps and wakes) on the same processor was also delayed, if the
+hypervisor stole processor time, or if the quota of the control group was used up.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,7 +27,7 @@ _MAX_SHOWN = 20
 
 
 class Trace(NamedTuple):
-    """Columns (wakings,) of the bare loop beside one process; counts as in `lowfc.adapters.process.host.Counts`."""
+    """Columns (wake-ups,) of the bare loop beside one process; counts as in `lowfc.adapters.process.host.Counts`."""
 
     due_ns: Long
     woke_ns: Long
@@ -40,9 +40,9 @@ class Trace(NamedTuple):
 
 
 class CountChanges(Result):
-    """Changes of the counts from the last waking of a bare loop before a stall to the first after it.
+    """Changes of the counts from the last wake-up of a bare loop before a stall to the first after it.
 
-    `bare_late_us` is the bare loop's largest wake-up latency in this time, both wakings included.
+    `bare_late_us` is the bare loop's largest wake-up latency in this time, both wake-ups included.
     """
 
     bare_late_us: float
@@ -66,7 +66,7 @@ class Stall(Result):
 
 
 class BareLoop(Result):
-    """An idle loop beside a process of the control loop; `stalled`: number of wake-ups more than a period late."""
+    """A bare loop beside a process of the control loop; `stalled`: number of wake-ups more than a period late."""
 
     beside: str = result_field("bare loop beside the")
     wakings: int = result_field("wake-ups")
@@ -113,7 +113,7 @@ def signs_of(counted: CountChanges, period_us: float) -> tuple[list[str], list[s
 
 
 def stalls_of(frames: FrameOutcomes, period_ns: int, traces: Mapping[str, Trace]) -> Stalls:
-    """The stalls among these frames, the warm-up left out; `traces`: of the bare loops, by the process beside."""
+    """The stalls among these frames, the warm-up left out; `traces` of bare loops are by the role beside."""
     command_us = frames.spans_us["frame_to_command"]
     after_warm_up = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
     slow = after_warm_up & (~frames.commanded | (command_us * 1e3 > period_ns))

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from lowfc.arrays import Array
-from lowfc.design.fisher import variance_e
+from lowfc.design.fisher import variance_e2
 from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S, TABLE4_READ_NOISE_E
 from lowfc.design.trials import noisy_e
 from lowfc.optics.chain.fourier import to_image, to_pupil
@@ -134,7 +134,7 @@ def fig10(context: Context) -> Iterator[Row]:
         for axis in (0, 1):
             row_name, (flat_e, change_e) = f"{name}, tilt {'xy'[axis]}", _tilted_e(sensor, axis)
             signal_e, paper = float(np.ptp(change_e)), PAPER_SIGNAL.get(sensor.paper_name)
-            ratio = np.abs(change_e) / np.sqrt(variance_e(flat_e + change_e, TABLE4_READ_NOISE_E))
+            ratio = np.abs(change_e) / np.sqrt(variance_e2(flat_e + change_e, TABLE4_READ_NOISE_E))
             yield Row(row_name, "P-V change of the image / its peak", "", signal_e / float(flat_e.max()), paper)
             yield Row(row_name, "P-V change of the image", "e-", signal_e)
             yield Row(row_name, "largest signal-to-noise ratio of a pixel", "", float(ratio.max()))

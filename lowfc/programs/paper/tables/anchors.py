@@ -58,7 +58,7 @@ LOOP = (
 )
 ROMAN = (
     "Roman (WFIRST) coronagraph, Milestone 6 (Shi et al., final report, 2015): about 14 mas of jitter (AAS 17-115) "
-    "reduced to less than 0.4 mas rms per axis at most reaction-wheel speeds. lowfc: preset reaction-wheel has five "
+    "reduced to less than 0.4 mas rms per axis for most reaction-wheel speeds. lowfc: preset reaction-wheel has five "
     "lines, 0.5 % wide, up to 117 Hz, and drift; in reaction-wheel-ideal the lines have no width, as on a testbed. "
     f"LQG is identified from {OBSERVED_S:g} s of the closed loop. limit: predicted from the log, with the noise of the "
     "quantum limit; one run may be below it. A mirror that holds its command for a frame leaves 0.72 mas of these "

@@ -1,4 +1,4 @@
-"""Sect. 4: conditioning of the modes behind an open circle, bars, and holes of several sizes."""
+"""Sect. 4: conditioning of the modes behind an open relay pupil, bars, and holes of several sizes."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -10,7 +10,7 @@ from lowfc.adapters.files.layouts import load_layout
 from lowfc.arrays import Array
 from lowfc.contract.sections import SensorSection
 from lowfc.control.calibration.calibration import condition_number
-from lowfc.design.fisher import cramer_rao, quantum_information, variance_e
+from lowfc.design.fisher import cramer_rao, quantum_information, variance_e2
 from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S, TABLE4_READ_NOISE_E
 from lowfc.optics.chain import sam as sams
 from lowfc.optics.chain.band import gauss_legendre
@@ -99,7 +99,7 @@ def _rows(kind: str, mask: Prepared) -> Iterator[Row]:
     yield Row(mask.name, "fraction of the open circle's light on the sensor", "", float(mask.I0.sum()))
     scale_e = electrons(STAR, TABLE4_EXPOSURE_S)
     yield from _noise_rows(mask, scale_e)
-    variance = variance_e(mask.I0 * scale_e, TABLE4_READ_NOISE_E)
+    variance = variance_e2(mask.I0 * scale_e, TABLE4_READ_NOISE_E)
     for modes in (2, 14):
         try:
             tilt = float(np.sqrt(cramer_rao(mask.H[:, :modes] * scale_e, variance)[0, 0]) / NM_PER_MAS)
@@ -115,7 +115,7 @@ def _noise_rows(mask: Prepared, light_e: float) -> Iterator[Row]:
     band = gauss_legendre(optics.wavelength_nm, count=4)
 
     def bound_nm2(I0: Array, H: Array) -> Array:
-        return np.diag(cramer_rao(H * light_e, variance_e(I0 * light_e, 0.0)))
+        return np.diag(cramer_rao(H * light_e, variance_e2(I0 * light_e, 0.0)))
 
     try:
         bound = bound_nm2(mask.I0, mask.H[:, :14])

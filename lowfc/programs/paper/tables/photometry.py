@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 from lowfc.arrays import Array
 from lowfc.contract.sections import SensorSection
-from lowfc.design.fisher import covariance, variance_e
+from lowfc.design.fisher import covariance, variance_e2
 from lowfc.design.paper import (
     STAR,
     TABLE3_INPUT_WAVES,
@@ -212,7 +212,7 @@ def _r2_contradiction(sam: Prepared) -> Iterator[Row]:
     gram, wavelength_nm = sam.gram[:14, :14], sam.optics.wavelength_nm
     wavefronts = next(reconstruction.inputs(sam, 14, literal=False))
     linear = reconstruction.fits(sam, 14)["pinv"]
-    spread = covariance(linear.R, variance_e(linear.reference_e, TABLE3_READ_NOISE_E)) / wavelength_nm**2
+    spread = covariance(linear.R, variance_e2(linear.reference_e, TABLE3_READ_NOISE_E)) / wavelength_nm**2
     spread *= (paper_out / expected_rms(gram, spread)) ** 2
     bounds = bounds_waves(NOLLS_14, wavefronts.low, wavefronts.high)
     yield Row(

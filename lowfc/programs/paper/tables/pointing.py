@@ -9,7 +9,7 @@ import numpy as np
 
 from lowfc.arrays import Array
 from lowfc.design.estimators import KINDS, Fit, estimate
-from lowfc.design.fisher import covariance, cramer_rao, variance_e
+from lowfc.design.fisher import covariance, cramer_rao, variance_e2
 from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S, TABLE4_MAS, TABLE4_READ_NOISE_E
 from lowfc.design.trials import noisy_e
 from lowfc.optics.chain.relay import ApertureMask
@@ -91,13 +91,13 @@ def fits(sensor: Prepared, exposure: Exposure, mas: int) -> dict[tuple[int, str]
 
 def bound_mas(linear: Fit) -> Array:
     """Cramer-Rao bounds (2,) of the tilts in x and y at the flat wavefront."""
-    bound = cramer_rao(linear.response_e, variance_e(linear.reference_e, TABLE4_READ_NOISE_E))
+    bound = cramer_rao(linear.response_e, variance_e2(linear.reference_e, TABLE4_READ_NOISE_E))
     return np.asarray(np.sqrt(np.diag(bound)[:2]) / NM_PER_MAS)
 
 
 def predicted_mas(linear: Fit, mean_e: Array) -> Array:
     """Standard deviations (2,) of the estimated tilts in x and y for an image with this mean (pixels,)."""
-    spread = covariance(linear.R[:2], variance_e(mean_e, TABLE4_READ_NOISE_E))
+    spread = covariance(linear.R[:2], variance_e2(mean_e, TABLE4_READ_NOISE_E))
     return np.asarray(np.sqrt(np.diag(spread)) / NM_PER_MAS)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from lowfc.arrays import Array
 from lowfc.design import trials
 from lowfc.design.estimators import KINDS, Fit, estimate, iterated
-from lowfc.design.fisher import cramer_rao, variance_e
+from lowfc.design.fisher import cramer_rao, variance_e2
 from lowfc.design.paper import MODES, PEAK_E, TABLE3_INPUT_WAVES, TABLE3_READ_NOISE_E, TABLE3_WAVES
 from lowfc.optics.chain.zernike import NOLLS_20
 from lowfc.programs.paper.cases import DEFAULT_SAM, Context, Prepared, Row, prepared, sparse_apertures
@@ -104,7 +104,7 @@ def exposed_e(sensor: Prepared, image: Array, rng: np.random.Generator) -> Array
 def bound_nm2(sensor: Prepared, modes: int) -> Array:
     """Cramer-Rao bound (modes, modes) of Table 3's exposure."""
     light_e = scale_e(sensor)
-    return cramer_rao(light_e * sensor.H[:, :modes], variance_e(light_e * sensor.I0, TABLE3_READ_NOISE_E))
+    return cramer_rao(light_e * sensor.H[:, :modes], variance_e2(light_e * sensor.I0, TABLE3_READ_NOISE_E))
 
 
 def fits(sensor: Prepared, modes: int, nuisances: bool = False) -> dict[str, Fit]:

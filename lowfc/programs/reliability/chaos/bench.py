@@ -53,7 +53,7 @@ class ProcessEnd:
     Attributes:
         name: name of the process.
         status: exit status; negative for a signal.
-        after_s: time from the request to end until the end.
+        after_s: time from the request that it end until it ended.
         requested: whether the case ended it, or waited for its end.
     """
 
