@@ -1,6 +1,7 @@
 """`last`, and several files of one recording as one log, in commands that read logs."""
 
 import os
+import shutil
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -13,7 +14,7 @@ from lowfc.adapters.files import calibration_file
 from lowfc.adapters.logs.parts import LAST, WholeLog, named_files, named_log, named_logs
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import recover
-from lowfc.adapters.logs.series import STANDARD, LogSeries
+from lowfc.adapters.logs.series import STANDARD, LogSeries, shortage
 from lowfc.adapters.logs.writer import Attachment, LogWriter
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import Configuration
@@ -227,3 +228,19 @@ def test_a_file_that_is_not_a_log_is_an_error(tmp_path: Path, arguments: list[st
         assert expected in str(done.exception)
         assert done.stdout == ""
     assert [path.name for path in tmp_path.iterdir()] == ["text"]
+
+
+def test_a_folder_that_is_removed_during_the_check_of_its_space_counts_as_absent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, usage = tmp_path / "logs", shutil.disk_usage
+    folder.mkdir()
+
+    def removing(path: Path) -> object:
+        if path == folder:
+            folder.rmdir()
+        return usage(path)
+
+    monkeypatch.setattr(shutil, "disk_usage", removing)
+    assert shortage(folder, 0) == ""
+    assert not folder.exists()

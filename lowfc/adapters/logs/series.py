@@ -1,6 +1,8 @@
 """Consecutive log files of a recording, limited in size, age and disk space."""
 
+import contextlib
 import shutil
+import stat
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -186,12 +188,16 @@ def _finish(log: LogWriter, totals: Mapping[str, str]) -> int:
 
 def shortage(folder: Path, min_free_bytes: int) -> str:
     """Sentence on too little space on the disk of `folder`, else empty; DataFileError if the folder is inaccessible."""
-    if not (parent := nearest_existing(folder)).is_dir():
+    with raised_as(DataFileError, OSError, f"{folder} cannot be accessed"):
+        while True:
+            parent = nearest_existing(folder)
+            with contextlib.suppress(FileNotFoundError):  # it has just been removed
+                is_folder, free_bytes = stat.S_ISDIR(parent.stat().st_mode), shutil.disk_usage(parent).free
+                break
+    if not is_folder:
         raise DataFileError(
             f"no log can be recorded in {folder}: {parent} is no folder; name another (recorder.folder)"
         )
-    with raised_as(DataFileError, OSError, f"{folder} cannot be accessed"):
-        free_bytes = shutil.disk_usage(parent).free
     if free_bytes >= min_free_bytes:
         return ""
     return (
