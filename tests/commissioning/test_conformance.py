@@ -48,7 +48,7 @@ from lowfc.testing.clock import FakeClock
 from tests.support.loops import json_of, refusal, until
 from tests.support.safety_checks import Simulated
 
-MS = 1_000_000
+MS_NS = 1_000_000
 LATENCY_NS = 100_000
 SMALL = {"camera.rate_hz": 100, "mirror.rows": 6, "mirror.columns": 7}
 CONFIG = load(None, SMALL)
@@ -84,7 +84,7 @@ class Device:
     def wait(self, seconds: float) -> None:
         end_ns = self.now_ns() + max(1, round(seconds * 1e9))
         while self.now_ns() < end_ns:
-            self.clock.advance(min(MS, end_ns - self.now_ns()))
+            self.clock.advance(min(MS_NS, end_ns - self.now_ns()))
             self.iterate(self.now_ns())
 
     def received(self) -> list[Received]:
@@ -113,7 +113,7 @@ class Device:
 
     def iterate(self, now_ns: int) -> None:
         if now_ns >= self._health_ns:
-            self._health_ns = now_ns + 500 * MS
+            self._health_ns = now_ns + 500 * MS_NS
             health = wire.Health(timestamp=timestamp(now_ns), process=self.process, state="running")
             for key, count in self.counts.items():
                 health.topics.add(topic=key, published=count)
@@ -186,7 +186,7 @@ class Mirror(Device):
     def iterate(self, now_ns: int) -> None:
         super().iterate(now_ns)
         self.status = self.changed("tick", self.mirror.tick)(self.status, now_ns)
-        if now_ns - self._published_ns >= 100 * MS and not self.changed("silent", False, self.status):
+        if now_ns - self._published_ns >= 100 * MS_NS and not self.changed("silent", False, self.status):
             self._publish(now_ns, now_ns)
 
     def _publish(self, time_ns: int, now_ns: int) -> None:
@@ -270,15 +270,15 @@ CAMERA_FAULTS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "a gap": ({"count": lambda count, _: count + 4 * (count > 100)}, {"sequence": WARNING}),
     "a publish time in us": ({"attach": publish_at(lambda t: t // 1000)}, {"publish time": WRONG}),
     "a monotonic clock": ({"attach": publish_at(lambda t: t - OFFSET_NS)}, {"publish time": WRONG}),
-    "another clock": ({"attach": publish_at(lambda t: t - 35 * MS)}, {"publish time": WRONG}),
+    "another clock": ({"attach": publish_at(lambda t: t - 35 * MS_NS)}, {"publish time": WRONG}),
     "a clock with a resolution of 25 ms": (
-        {"attach": publish_at(lambda t: t - t % (25 * MS))},
+        {"attach": publish_at(lambda t: t - t % (25 * MS_NS))},
         {"publish time": WRONG},
     ),
     "no frame time": ({"frame": lambda frame, _: frame.ClearField("timestamp") or frame}, {"frame time": WRONG}),
-    "a frame time ahead": ({"frame": shifted(20 * MS)}, {"frame time": WRONG}),
-    "a frame time an hour ago": ({"frame": shifted(-3600 * 1000 * MS)}, {"frame time": WRONG}),
-    "the start of the exposure": ({"frame": shifted(-5 * MS)}, {"frame time": WARNING}),
+    "a frame time ahead": ({"frame": shifted(20 * MS_NS)}, {"frame time": WRONG}),
+    "a frame time an hour ago": ({"frame": shifted(-3600 * 1000 * MS_NS)}, {"frame time": WRONG}),
+    "the start of the exposure": ({"frame": shifted(-5 * MS_NS)}, {"frame time": WARNING}),
     "undecodable bytes": ({"frame": lambda *_: b"\xff\xff\xff"}, {"frames": WRONG}),
     "eight bits": ({"frame": eight_bits}, {"bytes": WRONG}),
     "another encoding": ({"frame": setting(encoding="16UC1")}, {"encoding": WRONG}),
@@ -391,7 +391,7 @@ MIRROR_FAULTS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
         {"applied": WRONG} | UNTRIED,
     ),
     "its own timestamp instead of the command's": (
-        {"state": lambda state: shifted(3 * MS)(state, 0)},
+        {"state": lambda state: shifted(3 * MS_NS)(state, 0)},
         {"time": WARNING},
     ),
     "no modal command": ({"state": lambda state: state.ClearField("command_nm") or state}, {"modal command": WARNING}),
@@ -408,7 +408,7 @@ MIRROR_FAULTS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "no dead-man": ({"tick": lambda tick: lambda status, now_ns: status}, NEVER_EXPIRED),
     "a refused command extends the timeout": ({"renews": True}, {"dead-man": WRONG} | UNTRIED),
     "expired at once": (
-        {"tick": lambda tick: lambda status, now_ns: tick(status._replace(valid_for_ns=MS), now_ns)},
+        {"tick": lambda tick: lambda status, now_ns: tick(status._replace(valid_for_ns=MS_NS), now_ns)},
         {"dead-man": WRONG} | UNTRIED,
     ),
     "command_nm set while it relaxes": (
@@ -459,7 +459,7 @@ def test_an_answer_that_is_read_late_because_this_host_stalls_is_no_fault() -> N
 
 
 def test_a_command_that_expires_once_because_of_a_stall_is_tried_again() -> None:
-    first_timeout_ns = [MS]
+    first_timeout_ns = [MS_NS]
 
     def tick(tick: Any) -> Any:
         valid = mirror.status.valid_for_ns == EXPIRES_NS and first_timeout_ns and first_timeout_ns.pop()

@@ -70,7 +70,7 @@ def test_the_loop_is_not_closed_with_changed_camera_settings(name: str) -> None:
     state = open_loop_after(CAMERA, frame(1), WRONG_BIAS)
     after, reply = ask(state, name, **fields)
     assert not reply.accepted
-    assert "bias_dn is 160, calibrated 60" in reply.text
+    assert "bias_dn is 160, was 60 at the calibration" in reply.text
     assert (after.mode, after.steps_left) == (LoopMode.OPEN, 0)
     state, _ = feed(DEFAULTS, state, CAMERA)
     assert ask(state, name, **fields)[1].accepted

@@ -24,7 +24,7 @@ from tests.support.toy import DARK_DN, GRID, SATURATION_DN, SHAPE, START, calibr
 
 SETTINGS = settings()
 CAMERA = CameraSettings(START * 10**9, SHAPE, DARK_DN, SATURATION_DN)
-SECOND = 10**9
+SECOND_NS = 10**9
 PROCESSES = {
     "controller": wire.Health(
         last_second=wire.LoopFigures(frames=250, residual_rms_nm=2.5, flux_fraction=0.97),
@@ -33,13 +33,13 @@ PROCESSES = {
     "camera": wire.Health(
         recent_wavefront=wire.WavefrontFigures(residual_rms_nm=2.0),
         last_warning="COMMANDS_LATE 9 % late",
-        last_warning_timestamp=timestamp((START + 2) * SECOND),
+        last_warning_timestamp=timestamp((START + 2) * SECOND_NS),
     ),
     "recorder": wire.Health(
         state="ready",
         recording=wire.Recording(file="logs/a.mcap"),
         last_warning="DISK_SLOW the disk took 2 s",
-        last_warning_timestamp=timestamp((START + 1) * SECOND),
+        last_warning_timestamp=timestamp((START + 1) * SECOND_NS),
     ),
 }
 
@@ -48,25 +48,25 @@ def test_the_time_not_closed_is_summed_and_has_its_cause() -> None:
     account = NotClosed()
     assert account.note(loaded(SETTINGS), 0) == (0, "")
     state, _ = feed(SETTINGS, loaded(SETTINGS), CAMERA, frame(1))
-    assert account.note(state, 1 * SECOND) == (0, ""), "closed since its first frame"
+    assert account.note(state, 1 * SECOND_NS) == (0, ""), "closed since its first frame"
     state, _ = feed(SETTINGS, state, replace(CAMERA, bias_dn=DARK_DN + 300))
-    assert account.note(state, 2 * SECOND)[0] == 0
-    total_ns, cause = account.note(state, 5 * SECOND)
-    assert (total_ns, "bias_dn is 400" in cause) == (3 * SECOND, True)
+    assert account.note(state, 2 * SECOND_NS)[0] == 0
+    total_ns, cause = account.note(state, 5 * SECOND_NS)
+    assert (total_ns, "bias_dn is 400" in cause) == (3 * SECOND_NS, True)
 
 
 def test_every_cause_of_a_loop_that_was_not_closed_is_named() -> None:
     account, (state, _) = NotClosed(), feed(SETTINGS, loaded(SETTINGS), CAMERA, frame(1))
     account.note(state, 0)
     for number, name in enumerate(("open", "close", "pause", "close", "open", "close"), 1):
-        state, _ = feed(SETTINGS, state, Request(number * SECOND, name))
-        account.note(state, number * SECOND)
-        cause = account.note(state, number * SECOND + 1)[1]
+        state, _ = feed(SETTINGS, state, Request(number * SECOND_NS, name))
+        account.note(state, number * SECOND_NS)
+        cause = account.note(state, number * SECOND_NS + 1)[1]
     assert cause == "operator asked to open (2 times); operator asked to pause (1 time)"
     for number in range(50):
         conditions = state.conditions._replace(mode_cause=f"cause {number}")
-        account.note(state._replace(mode=LoopMode.OPEN, conditions=conditions), (10 + number) * SECOND)
-    cause = account.note(state, 100 * SECOND)[1]
+        account.note(state._replace(mode=LoopMode.OPEN, conditions=conditions), (10 + number) * SECOND_NS)
+    cause = account.note(state, 100 * SECOND_NS)[1]
     assert cause.startswith("cause 49 (1 time); operator asked to open (2 times); operator asked to pause (1 time); ")
     assert cause.endswith("; other causes (48 times)")
 
@@ -76,8 +76,8 @@ def test_the_causes_that_lasted_longest_are_named() -> None:
     causes = ["open", "step", "pause", "step", "one", "two", "three", "open", "safe"]
     for time_s, cause in enumerate(causes):
         conditions = state.conditions._replace(mode_cause=cause)
-        account.note(state._replace(mode=LoopMode.OPEN, conditions=conditions), time_s * SECOND)
-    cause = account.note(state, 100 * SECOND)[1]
+        account.note(state._replace(mode=LoopMode.OPEN, conditions=conditions), time_s * SECOND_NS)
+    cause = account.note(state, 100 * SECOND_NS)[1]
     assert cause == "safe (1 time); open (2 times); step (2 times); pause (1 time); other causes (3 times)"
 
 
@@ -86,7 +86,7 @@ def test_the_closed_fraction_is_that_of_the_time_between_first_and_last_frame(
     not_closed_s: int, fraction: float
 ) -> None:
     received = wire.TopicCount(topic=FRAME.key, received=1001)
-    controller = wire.Health(topics=[received], not_closed_ns=not_closed_s * SECOND)
+    controller = wire.Health(topics=[received], not_closed_ns=not_closed_s * SECOND_NS)
     camera = wire.Health(mean_rate_hz=100.0)
     assert summary(Watch({"controller": controller, "camera": camera}, []), False)["closed_fraction"] == fraction
     camera.mean_rate_hz = 30.0  # in lockstep: frames per second of real time
@@ -106,22 +106,22 @@ def test_summary_and_status_show_the_time_not_closed() -> None:
     results = summary(Watch({"camera": camera}, []), record=False)
     assert "over the open pupil, second half of the run, sampled" in summary_text(results)
     assert "second half of the run, in part not closed, sampled" in summary_text(results | {"closed_fraction": 0.2})
-    not_closed = {"not_closed_ns": 3 * SECOND, "not_closed_cause": "the camera does not fit"}
+    not_closed = {"not_closed_ns": 3 * SECOND_NS, "not_closed_cause": "the camera does not fit"}
     assert first_line(mode=wire.LOOP_MODE_CLOSED) == "closed"
     expected = "closed; not closed for 3.0 s in total: the camera does not fit"
     assert first_line(mode=wire.LOOP_MODE_CLOSED, **not_closed) == expected
     assert first_line(mode=wire.LOOP_MODE_OPEN, **not_closed) == expected.replace("closed;", "open;")
     assert first_line(mode=wire.LOOP_MODE_SAFE, **not_closed) == expected.replace("closed;", "in safe mode;")
-    not_closed["not_closed_ns"] = 10 * SECOND
+    not_closed["not_closed_ns"] = 10 * SECOND_NS
     expected = "; not closed during the run: the camera does not fit"
     assert first_line(mode=wire.LOOP_MODE_OPEN, **not_closed) == f"open{expected}"
     assert first_line(mode=wire.LOOP_MODE_CLOSED, **not_closed) == f"closed at the end{expected}"
-    short = first_line(mode=wire.LOOP_MODE_CLOSED, not_closed_ns=SECOND // 25)
+    short = first_line(mode=wire.LOOP_MODE_CLOSED, not_closed_ns=SECOND_NS // 25)
     assert short == "closed; not closed for 0.04 s in total"
     assert screen(Watch({}, [Log(message="without a level")]), Configuration(), None, 1.0), "shown without an error"
     assert first_line() == "no controller reported", "no time is shown before the controller reports a mode"
     state, _ = feed(SETTINGS, loaded(SETTINGS), CAMERA, frame(1), replace(CAMERA, bias_dn=DARK_DN + 300))
-    message = controller_state(state, SETTINGS, (START + 12) * SECOND)
+    message = controller_state(state, SETTINGS, (START + 12) * SECOND_NS)
     mirror = wire.Health(command_refused=wire.REASON_OUT_OF_ORDER)
     _, *lines = status.text(status.json_object(message, {"mirror-dm": mirror})).splitlines()
     assert lines[0].split(maxsplit=1)[1].startswith("open for 12 s (the camera does not fit the calibration: bias_dn")
@@ -138,7 +138,7 @@ def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> Non
     state, _ = feed(SETTINGS, loaded(SETTINGS), CAMERA, frame(1))
 
     def first_line(**changes: Any) -> str:
-        message = controller_state(state, SETTINGS, (START + 12) * SECOND)
+        message = controller_state(state, SETTINGS, (START + 12) * SECOND_NS)
         return status.text(status.json_object(message, PROCESSES | changes, "night")).splitlines()[0]
 
     normal = (
@@ -159,12 +159,12 @@ def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> Non
     )
     assert first_line(camera=wire.Health(), recorder=wire.Health()).endswith(" · no warning")
     before = state
-    state, _ = feed(SETTINGS, state, Request((START + 2) * SECOND, "offset", (2,), (20.0,)))
+    state, _ = feed(SETTINGS, state, Request((START + 2) * SECOND_NS, "offset", (2,), (20.0,)))
     assert "residual 2.50 nm rms, noise included (true 2.00 over 2 s, with offset and channels) ·" in first_line()
     state = before
     mode_texts = ("paused", "open", "open", "closed", "in safe mode")  # `pause` of an open loop leaves it open
     for name, mode_text in zip(("pause", "open", "pause", "close", "safe"), mode_texts, strict=True):
-        state, (outputs,) = feed(SETTINGS, state, Request((START + 2) * SECOND, name))
+        state, (outputs,) = feed(SETTINGS, state, Request((START + 2) * SECOND_NS, name))
         assert outputs.reply.accepted
         assert first_line().startswith(f"{mode_text} ·")
         assert status.json_object(controller_state(state, SETTINGS, 0))["paused"] == (mode_text == "paused")
@@ -198,7 +198,7 @@ def test_added_contrast_is_shown_for_a_flat_mirror_and_the_present_one() -> None
     recent = wire.WavefrontFigures(added_contrast_flat=7e-10, added_contrast=-4e-11)
     published = wire.TopicCount(topic=FRAME.key, published=1)
     camera = wire.Health(recent_wavefront=recent, wavefront=recent, topics=[published])
-    message = controller_state(loaded(SETTINGS), SETTINGS, (START + 12) * SECOND)
+    message = controller_state(loaded(SETTINGS), SETTINGS, (START + 12) * SECOND_NS)
     watch = Watch({"camera": camera}, [])
     expected = "added to the dark zone's contrast: flat mirror +7.0e-10, residual -4.0e-11"
     quadratic = f"{expected}; quadratic form, valid to 3 nm rms of a mode"
@@ -218,8 +218,8 @@ def test_added_contrast_is_shown_for_a_flat_mirror_and_the_present_one() -> None
 
 
 def test_statistics_of_the_last_second_exclude_older_and_refused_frames() -> None:
-    state, last = loaded(SETTINGS), LastSecond(SECOND // 4)
-    assert last.statistics(state, SECOND) == wire.LoopFigures()
+    state, last = loaded(SETTINGS), LastSecond(SECOND_NS // 4)
+    assert last.statistics(state, SECOND_NS) == wire.LoopFigures()
     flux_dn = state.loop.calibration.flux_dn
 
     def step(error_nm: float | None) -> Step:
@@ -227,10 +227,10 @@ def test_statistics_of_the_last_second_exclude_older_and_refused_frames() -> Non
         return Step(1, 0, LoopMode.CLOSED, np.zeros(4, np.float32), (), errors, None, flux_dn / 2)
 
     for quarter, error_nm in enumerate((9.0, 9.0, 9.0, 9.0, 9.0, 1.0, 1.0, None, 1.0, 1.0)):
-        last.add(step(error_nm), quarter * SECOND // 4)
-    figures = last.statistics(state, 9 * SECOND // 4)
+        last.add(step(error_nm), quarter * SECOND_NS // 4)
+    figures = last.statistics(state, 9 * SECOND_NS // 4)
     assert (figures.frames, figures.residual_rms_nm, figures.flux_fraction) == pytest.approx((3, 2.0, 0.5))
-    assert last.statistics(state, 20 * SECOND).frames == 0
+    assert last.statistics(state, 20 * SECOND_NS).frames == 0
 
 
 def test_the_status_line_shows_recent_statistics_and_none_before_the_first_frame() -> None:
@@ -242,11 +242,11 @@ def test_the_status_line_shows_recent_statistics_and_none_before_the_first_frame
     watch.health["camera"].mean_rate_hz = 250
     assert "closed     250 Hz  residual 2.20 of 30.00 nm rms" in status_line(watch, 10.0)
     received = wire.TopicCount(topic=FRAME.key, received=900)
-    controller = wire.Health(mode=wire.LOOP_MODE_CLOSED, topics=[received], not_closed_ns=2 * SECOND)
+    controller = wire.Health(mode=wire.LOOP_MODE_CLOSED, topics=[received], not_closed_ns=2 * SECOND_NS)
     early = Watch(watch.health | {"controller": controller}, [])
     assert "closed for 1.6 s     250 Hz" in status_line(early, 5.0), "the residual includes open-loop frames"
     assert "closed for 2.0 s  225 Hz in simulated time" in status_line(early, 5.0, 225.0)
-    controller.topics[0].received, controller.not_closed_ns = 250 * 3601, 3600 * SECOND
+    controller.topics[0].received, controller.not_closed_ns = 250 * 3601, 3600 * SECOND_NS
     early.health["camera"].rate_hz = 250.4  # the rate of the last half second
     assert "closed for 1.0 s     250 Hz" in status_line(early, 5.0)
     with Console(width=120, file=io.StringIO(), record=True) as console:

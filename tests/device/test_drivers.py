@@ -38,7 +38,7 @@ from tests.support.loops import lowfc
 
 GRID = (4, 5)
 CONFIG = load(None, {"mirror.rows": GRID[0], "mirror.columns": GRID[1]})
-MS = 1_000_000
+MS_NS = 1_000_000
 
 
 class Ramp:
@@ -55,7 +55,7 @@ class Ramp:
         self.level, self.closed = options.level, False
 
     def settings(self) -> CameraSettings:
-        return CameraSettings(3, 4, exposure_ns=2 * MS, period_ns=4 * MS, bit_depth=12)
+        return CameraSettings(3, 4, exposure_ns=2 * MS_NS, period_ns=4 * MS_NS, bit_depth=12)
 
     def expose(self) -> Exposure | None:
         self.level += 1
@@ -85,7 +85,7 @@ def test_a_camera_publishes_what_its_driver_returns() -> None:
     assert [frame.data for frame in frames] == [np.full((3, 4), level, np.uint16).tobytes() for level in (8, 9, 10)]
     assert {frame.timestamp.ToNanoseconds() for frame in frames} == {clock.now_ns()}
     state = listener.messages(CAMERA_STATE)[-1]
-    assert (state.rows, state.columns, state.saturation_dn, state.exposure_ns) == (3, 4, 4095, 2 * MS)
+    assert (state.rows, state.columns, state.saturation_dn, state.exposure_ns) == (3, 4, 4095, 2 * MS_NS)
     assert driver.closed
     assert listener.events() == ["STARTED", "STOPPED"]
 
@@ -382,4 +382,4 @@ def test_camera_clock_is_converted_to_within_the_shortest_transfer_time() -> Non
     for settled_errors_ns in (errors_ns[100:6000], errors_ns[6100:]):
         assert max(map(abs, settled_errors_ns)) < 300_000
     assert min(errors_ns[6000:]) > -300_000, "the offsets before the pause are not used after it"
-    assert clock.monotonic_ns(MS, end_ns + 10**9) == end_ns + 10**9, "the camera's clock restarted"
+    assert clock.monotonic_ns(MS_NS, end_ns + 10**9) == end_ns + 10**9, "the camera's clock restarted"

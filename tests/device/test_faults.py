@@ -31,7 +31,7 @@ from lowfc.testing.listener import Listener
 CONFIG = load(None, {"mirror.rows": 4, "mirror.columns": 5})
 SETTINGS = CameraSettings(3, 4, exposure_ns=2_000_000, period_ns=4_000_000, number_wrap=1 << 16)
 GOOD = np.full((3, 4), 7, np.uint16)
-MS = 1_000_000
+MS_NS = 1_000_000
 
 
 class UnprintableError(Exception):
@@ -179,16 +179,16 @@ def test_a_driver_whose_settings_are_of_another_type_is_refused() -> None:
 
 
 def test_expose_may_return_none_and_settings_are_published_twice_a_second_meanwhile() -> None:
-    bench = CameraBench(settings=replace(SETTINGS, period_ns=2000 * MS))
+    bench = CameraBench(settings=replace(SETTINGS, period_ns=2000 * MS_NS))
     results = iter([None] * 200 + [Exposure(GOOD)])
 
     def wait() -> Exposure | None:
-        bench.clock.advance(10 * MS)
+        bench.clock.advance(10 * MS_NS)
         return next(results)
 
     begun_ns, bench.camera.expose = bench.clock.now_ns(), wait
     bench.loop.run()
-    times_ms = [(sample.publish_time_ns - begun_ns) // MS for sample in bench.listener.samples[CAMERA_STATE]]
+    times_ms = [(sample.publish_time_ns - begun_ns) // MS_NS for sample in bench.listener.samples[CAMERA_STATE]]
     assert times_ms == [0, 0, 500, 1000, 1500, 2000], "at the start, with the first exposure, twice a second"
     assert bench.listener.events() == ["STARTED", "STOPPED"]
 
@@ -199,10 +199,10 @@ def test_exposure_times_are_converted_from_the_clock_in_the_settings(monkeypatch
     monkeypatch.setattr(FakeClock, "ahead_ns", lambda self: 2 * 10**9)
     start_ns = FakeClock().now_ns()
     for clock, behind_ns in (("monotonic", 5 * 10**9), ("realtime", 2 * 10**9)):
-        settings = CameraSettings(3, 4, 2 * MS, 4 * MS, clock=clock)
-        listener = run_camera_loop(good(end_ns=start_ns + MS - behind_ns), good(), frames=2, settings=settings)
+        settings = CameraSettings(3, 4, 2 * MS_NS, 4 * MS_NS, clock=clock)
+        listener = run_camera_loop(good(end_ns=start_ns + MS_NS - behind_ns), good(), frames=2, settings=settings)
         times = [frame.timestamp.ToNanoseconds() - start_ns for frame in listener.messages(FRAME)]
-        assert times == [MS, 8 * MS], "the second frame is timed at its reception"
+        assert times == [MS_NS, 8 * MS_NS], "the second frame is timed at its reception"
 
 
 def numbered(*numbers: int | np.uint16) -> Listener:
@@ -247,7 +247,7 @@ def test_restarted_frame_numbers_are_a_new_start_even_twice_in_a_second() -> Non
 
 def test_a_changed_region_is_published_before_its_first_frame() -> None:
     def cropped() -> Exposure:
-        bench.camera.current = CameraSettings(2, 4, 2 * MS, 4 * MS)
+        bench.camera.current = CameraSettings(2, 4, 2 * MS_NS, 4 * MS_NS)
         return Exposure(GOOD[1:])
 
     bench = CameraBench(good(), cropped, frames=2)
@@ -293,7 +293,7 @@ class MirrorBench:
         return self.state()
 
     def tick(self, ms: int = 10) -> wire.MirrorState:
-        self.clock.advance(ms * MS)
+        self.clock.advance(ms * MS_NS)
         self.loop._idle()
         return self.state()
 

@@ -55,4 +55,4 @@ def changes(now: CameraSettings, then: CameraSettings) -> list[str]:
     different += [(name, new, old) for name, new, old in levels if not abs(new - old) <= tolerance_dn]
     known_gains = ((name, new, old) for name, new, old in gains if min(new, old) > 0)
     different += [(name, new, old) for name, new, old in known_gains if abs(new / old - 1) > GAIN_TOLERANCE]
-    return [f"{name} is {new:g}, calibrated {old:g}" for name, new, old in different]
+    return [f"{name} is {new:g}, was {old:g} at the calibration" for name, new, old in different]
