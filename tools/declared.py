@@ -81,7 +81,7 @@ _ACCEPTANCE = (
 )
 _OPERATING = (
     *_NEW_LAW,
-    ("frames or steps queued for a Python program, at most", stream.WAITING),
+    ("frames or steps queued for a Python program, at most", stream.BUFFERED_MESSAGES),
     ("size of a request, at most, MB", max_bytes("law") / 1e6),
 )
 

@@ -31,7 +31,7 @@ SEEDS = tuple(range(1, 21))
 MOVED = (("reaction-wheel-ideal", 1.02), ("reaction-wheel", 1.05), ("reaction-wheel", 1.10))
 MAGNITUDES = (0.0, 2.0, 5.0)
 AMPLITUDE_MAS = 5.0
-"""Amplitude of a square wave of period 4 s in tip and tilt, so that its steps are twice as large."""
+"""Amplitude of a square wave of period 4 s in tip and tilt; its steps, every 2 s, are twice as large."""
 MINUTES = 10.0
 _IDENTIFY, _SETTLE, _BEFORE = 48_000, 12_000, 2_000
 """Frames: for identification of a law, in open loop, and in closed loop before the lines move."""
@@ -95,7 +95,7 @@ def tilt_after_move(
 
 
 def times_overruled(case: Case, seed: int, minutes: float = MINUTES) -> int:
-    """Number of times a good law is overruled, with steps and lines that wander within their width."""
+    """Number of times a good law is overruled, with unmodelled steps and lines of finite width that are not moved."""
     bench = case.bench(case.configured(seed), case.law, AMPLITUDE_MAS)
     bench.run(round(minutes * 60 * RATE_HZ), record=False)
     if bench.frames_refused:

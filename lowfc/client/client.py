@@ -28,7 +28,7 @@ from lowfc.client.lease import Lease, new_identity
 from lowfc.client.mirror_watch import MirrorWatch
 from lowfc.client.requests import BY_NAME
 from lowfc.client.runs import absence, the_run
-from lowfc.client.stream import SILENT_S, WAITING, Frame, Stream, frame_of, step_of
+from lowfc.client.stream import BUFFERED_MESSAGES, DEFAULT_TIMEOUT_S, Frame, Stream, frame_of, step_of
 from lowfc.contract.codecs.calibration_codec import camera_settings, decode_calibration, encode_calibration
 from lowfc.contract.codecs.codec import max_bytes
 from lowfc.contract.codecs.law_codec import wire_law
@@ -311,13 +311,13 @@ class Client:
             published.store(LAW, sample.payload)
         return published.laws
 
-    def frames(self, count: int | None = None, patience_s: float = SILENT_S) -> Stream[Frame]:
+    def frames(self, count: int | None = None, patience_s: float = DEFAULT_TIMEOUT_S) -> Stream[Frame]:
         """Stream sensor images from now on, `count` of them or without end; BusError if none comes for `patience_s`."""
-        return Stream(self._bus.ring(FRAME, WAITING), frame_of, "frame", count, patience_s)
+        return Stream(self._bus.ring(FRAME, BUFFERED_MESSAGES), frame_of, "frame", count, patience_s)
 
-    def steps(self, count: int | None = None, patience_s: float = SILENT_S) -> Stream[Step]:
+    def steps(self, count: int | None = None, patience_s: float = DEFAULT_TIMEOUT_S) -> Stream[Step]:
         """Stream steps of the control law from now on, `count` of them or without end; see `frames`."""
-        return Stream(self._bus.ring(STEP, WAITING), step_of, "step", count, patience_s)
+        return Stream(self._bus.ring(STEP, BUFFERED_MESSAGES), step_of, "step", count, patience_s)
 
     def mirror_watch(self) -> MirrorWatch:
         """Watch the mirror's reports from now on; see `MirrorWatch`."""

@@ -6,7 +6,7 @@ from collections import deque
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.bus import Bus, Ring, name_in
-from lowfc.client.stream import SILENT_S, WAITING
+from lowfc.client.stream import BUFFERED_MESSAGES, DEFAULT_TIMEOUT_S
 from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import EVENT, MIRROR_STATE, Log, wire
@@ -30,16 +30,16 @@ class MirrorWatch:
     def __init__(self, bus: Bus) -> None:
         """Subscribe to the mirrors' states and events; BusError if no mirror reports."""
         self.interruption, self.offset = "", bus.offset
-        self.applied: deque[tuple[int, int]] = deque(maxlen=WAITING)
-        self._events: Ring = bus.ring(EVENT, WAITING)
-        self._states: Ring = bus.ring(MIRROR_STATE, WAITING)
+        self.applied: deque[tuple[int, int]] = deque(maxlen=BUFFERED_MESSAGES)
+        self._events: Ring = bus.ring(EVENT, BUFFERED_MESSAGES)
+        self._states: Ring = bus.ring(MIRROR_STATE, BUFFERED_MESSAGES)
         # by name of the mirror: start of its process, frame of its command, whether it follows commands
         self._mirrors: dict[str, tuple[int, int, bool]] = {}
-        deadline_s = time.monotonic() + SILENT_S
+        deadline_s = time.monotonic() + DEFAULT_TIMEOUT_S
         self.read()
         while not self._mirrors:
             if time.monotonic() >= deadline_s:
-                raise BusError(f"no mirror state came within {SILENT_S:g} s: is the mirror's process running?")
+                raise BusError(f"no mirror state came within {DEFAULT_TIMEOUT_S:g} s: is the mirror's process running?")
             time.sleep(_POLL_S)
             self.read()
 

@@ -21,9 +21,9 @@ from lowfc.control.loop.safety import LoopMode, reason_of
 
 T = TypeVar("T")
 
-WAITING = 1024
+BUFFERED_MESSAGES = 1024
 """Messages that a stream buffers: one second of a 1 kHz loop."""
-SILENT_S = 5.0
+DEFAULT_TIMEOUT_S = 5.0
 """Default timeout for the next message."""
 _POLL_S = 0.002
 
@@ -47,7 +47,7 @@ class Stream(Generic[T]):
     def __init__(
         self, ring: Ring, decode: Callable[[Sample], T | None], what: str, count: int | None, patience_s: float
     ) -> None:
-        """Wait for the first of `count` messages, or of an endless stream, in `ring`; BusError if none arrives.
+        """Wait for the first message in `ring`; BusError if none arrives. The stream ends after `count` messages.
 
         `decode` returns None for an invalid message; `what` names the messages in errors; `patience_s` is the timeout.
         """
@@ -63,7 +63,7 @@ class Stream(Generic[T]):
 
     @property
     def lost(self) -> int:
-        """Number of messages since the first that were damaged, or lost, as when the reader is too slow."""
+        """Number of damaged or lost messages since the first one; a reader that is too slow loses messages."""
         return self._damaged + sum(gaps.missing for gaps in self._gaps.values())
 
     def __iter__(self) -> "Stream[T]":

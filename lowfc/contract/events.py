@@ -56,7 +56,7 @@ EVENTS: dict[str, Event] = {
         Event(
             "CLOCK_OFF",
             Level.WARNING,
-            "this boot's clock is {ahead_ms:+.0f} ms from the wall clock, and so are all times; see `lowfc doctor`",
+            "the clock of all runs is {ahead_ms:+.0f} ms from the wall clock, and so are all times; see `lowfc doctor`",
         ),
         Event("REALTIME_REFUSED", Level.WARNING, "the host refused {measure}: {cost}"),
         Event("KERNEL", Level.INFO, "control step: {kernel}"),

@@ -10,7 +10,7 @@ from lowfc.contract.network import WithoutNul
 Preset = Literal["quiet", "bench", "thermal", "reaction-wheel", "reaction-wheel-ideal", "step", "kolmogorov"]
 
 MIRROR_NAME = r"^[a-z][a-z0-9_]{0,49}$"
-"""Regular expression for the name of a mirror; with "mirror-" before it, the name is short enough for a certificate."""
+"""Regular expression for a mirror's name; with "mirror-" before it, it fits the common name of a TLS certificate."""
 BENCH_NAME = r"^[A-Za-z][A-Za-z0-9_-]{0,63}$"
 """Regular expression for the name of a bench value."""
 MAX_VALUE = 1e12
@@ -148,7 +148,7 @@ class Camera(Section):
     rate_hz: float = Field(250.0, ge=0.001, le=20_000)
     """Frames per second."""
     exposure_fraction: float = Field(0.5, gt=0, le=1)
-    """Exposure time as a fraction of the frame period; the loop reacts in the rest."""
+    """Exposure time as a fraction of the frame period; the rest is for read-out, computation and the mirror."""
     quantum_efficiency: float = Field(0.8, gt=0, le=1)
     """Electrons per photon."""
     read_noise_e: NotNegative = 1.0
@@ -217,8 +217,8 @@ class Disturbance(Section):
     """Rate of change of the wheel's speed: ramp, Hz per second; walk, Hz per root second; run-down, decrease at time 0
     in Hz per second. 0 for constant speed."""
     second_wheel_hz: Signed = 0.0
-    """Initial speed of a second, identical wheel minus that of the first, turns per second; the two beat. 0: no second
-    wheel."""
+    """Difference of a second, identical wheel's initial speed from the first's, turns per second; the two beat. 0: no
+    second wheel."""
 
     @model_validator(mode="after")
     def _possible(self) -> "Disturbance":
@@ -275,7 +275,7 @@ class Mirror(Section):
     active: str = ""
     """Map of the active actuators (FITS or .npy), 0 or 1: modes and flat map exclude the others; empty for all."""
     nm_per_unit: float = Field(1.0, ge=1e-9, le=1e9)
-    """nm of surface per unit written, for your own driver or one with VoltMap; isio has its own option of this name."""
+    """nm of surface per unit written, for your own driver or one with `lowfc.device.VoltMap`; isio has its own."""
     shift_pitches: float = Field(0.0, ge=-2, le=2)
     """Simulated mirror: misregistration of its actuators along x and along y, pitches."""
     magnification: float = Field(1.0, ge=0.9, le=1.1)

@@ -23,6 +23,6 @@ TABLE3_WAVES = {
     "bowtie": {14: (4.6e-4, 8.0e-3), 20: (6.8e-4, 0.017)},
     "clowfs": {14: (1.3e-3, 0.022), 20: (2.3e-3, 0.066)},
 }
-"""Mean rms and peak-to-valley residuals, waves, by sensor (sparse aperture, disk or bow-tie; CLOWFS) and modes."""
+"""Mean rms and peak-to-valley residuals, waves, by sensor (SAM with disk or bow-tie mask; CLOWFS) and modes."""
 TABLE4_MAS = {"sam": {1: 0.36, 10: 0.37}, "clowfs": {1: 0.080, 10: 0.082}}
 """Standard deviation of the tilt estimate, mas, by sensor and by the true tilt in mas."""

@@ -99,7 +99,7 @@ def test_a_wrong_clock_is_reported_at_the_start(
 ) -> None:
     monkeypatch.setattr(clock, "ahead_ns", lambda: ahead_ms * 1_000_000)
     listener.service("camera")
-    events = listener.event_texts(f"CLOCK_OFF this boot's clock is {ahead_ms:+d} ms from the wall clock")
+    events = listener.event_texts(f"CLOCK_OFF the clock of all runs is {ahead_ms:+d} ms from the wall clock")
     assert len(events) == len(listener.event_texts("CLOCK_OFF")) == reported
 
 

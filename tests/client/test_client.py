@@ -24,7 +24,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Answer, Client, Frame, Stream, client, configuration_of, running, the_run
 from lowfc.client.requests import DECLARED
 from lowfc.client.runs import absence, waiting_message
-from lowfc.client.stream import WAITING, frame_of, step_of
+from lowfc.client.stream import BUFFERED_MESSAGES, frame_of, step_of
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.bench_codec import decode_bench_value
 from lowfc.contract.codecs.calibration_codec import encode_calibration, with_identity
@@ -529,17 +529,17 @@ def test_an_ended_stream_unsubscribes(controller: FakeController) -> None:
 
 
 def test_a_slow_reader_loses_the_oldest_frames(controller: FakeController, loop: Client) -> None:
-    ring = loop._bus.ring(FRAME, WAITING)
+    ring = loop._bus.ring(FRAME, BUFFERED_MESSAGES)
     publisher = controller.bus.publisher(FRAME)
     payload = frame_sample(1).payload
-    for _ in range(WAITING + 30):
+    for _ in range(BUFFERED_MESSAGES + 30):
         publisher.put(payload)
-    frames = Stream(ring, frame_of, "frame", WAITING, 0.02)
+    frames = Stream(ring, frame_of, "frame", BUFFERED_MESSAGES, 0.02)
     first = next(frames)
     for _ in range(5):
         publisher.put(payload)
     assert first.number == 30
-    assert len(list(frames)) == WAITING - 1
+    assert len(list(frames)) == BUFFERED_MESSAGES - 1
     assert frames.lost == 0, "frames lost before the first one that was read do not count"
 
 

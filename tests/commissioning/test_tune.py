@@ -90,9 +90,9 @@ def test_predictions_contain_the_part_of_a_constant_disturbance_that_a_leak_leav
     assert focus.predicted_now_nm == pytest.approx(50 * 0.01 / (0.01 + 0.2), rel=0.1)
 
 
-def test_the_true_residual_over_all_time_is_read_from_the_log(tmp_path: Path) -> None:
+def test_the_true_residual_in_continuous_time_is_read_from_the_log(tmp_path: Path) -> None:
     night = SyntheticLog()
-    night.instants = 4  # the residual over all time is then twice that at the start of the exposures
+    night.instants = 4  # the residual in continuous time is then twice that at the starts of exposures
     night.request("close").frames(2100)
     del night.samples[night.indices(TRUTH)[1200]]  # as if it were lost
     run = telemetry_from_log(LogReader(night.write(tmp_path / "night.mcap")))
@@ -189,8 +189,10 @@ def test_a_loop_that_was_closed_for_just_enough_frames_and_then_opened_is_tuned_
     assert (result["closed"], result["frames"], result["warnings"]) == (True, 2048, [])
 
 
-def test_a_weighted_reconstructor_is_reported_and_a_flat_map_is_not(closed: SyntheticLog, tmp_path: Path) -> None:
-    """A gain for a mode that had none would replace this reconstructor by one with more noise."""
+def test_a_reconstructor_with_a_prior_for_uncorrected_modes_is_reported_and_a_flat_map_is_not(
+    closed: SyntheticLog, tmp_path: Path
+) -> None:
+    """The prior is the power of a mode without a gain; a gain for Z4 would remove it, and the noise of others rises."""
     night = closed.copy()
     night.change(CONTROLLER_STATE, -1, lambda state: state.prior_nm2.extend([0, 0, 4]))
     night.change(CONTROLLER_STATE, -1, lambda state: state.channels.add(name="flat"))
@@ -229,8 +231,8 @@ PROBE = wire.Play(first_sequence=frame_sequence(3050), frames=100, id="probe")
 class SteppedLoop(InProcessLoop):
     """A loop with these steps, whose mirror reports each command `report_periods` frame periods after the exposure.
 
-    With a `later_gain`, the state requested after 3100 steps is the only one with the probe sequence; this state and
-    all later ones have that gain.
+    With a `later_gain`, the state at step 3100 is the only one with the probe sequence; it and all later ones have that
+    gain.
     """
 
     lost, offset = 0, None  # number of steps that the client lost, and offset of the clock of the mirror's host
@@ -272,7 +274,7 @@ def noisy_steps() -> list[Step]:
 
 
 def test_tuning_uses_the_steps_of_a_running_loop() -> None:
-    """Missing and refused frames are bridged; the first half second after closing is excluded."""
+    """Missing and refused frames are interpolated; the first half second after closing is excluded."""
     loop = SteppedLoop(noisy_steps())
     loop.lost = 4
     loop.mirror_watch = Mock(side_effect=BusError("the mirror does not report"))
@@ -305,7 +307,7 @@ def test_the_mirrors_reports_give_the_time_at_which_commands_are_applied() -> No
 
 
 def closed_loop(disturbance_nm: np.ndarray, delay_frames: int) -> list[Step]:
-    """Steps at a disturbance (frames, modes): the commands are noise, and the controller assumes a delay of 1 frame."""
+    """Steps of a loop with this disturbance (frames, modes): commands are noise; the assumed delay is 1."""
     command_nm = np.random.default_rng(7).standard_normal(disturbance_nm.shape).astype(np.float32)
     error_nm = disturbance_nm + np.concatenate([np.zeros((delay_frames, 3), np.float32), command_nm[:-delay_frames]])
     pol_nm = error_nm - np.concatenate([np.zeros((1, 3), np.float32), command_nm[:-1]])

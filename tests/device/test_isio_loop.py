@@ -211,7 +211,7 @@ def test_a_minute_at_500_hz_loses_no_frame_and_matches_the_simulated_loop(folder
             with Client("bench") as client:
                 state = client.status().state
         assert not [event for event in bench.events if "FRAMES" in event and "LATE" not in event]
-        assert sum(entry.count for entry in state.counts) < 0.01 * state.frames_used  # refused frames, as late ones
+        assert sum(entry.count for entry in state.counts) < 0.01 * state.frames_used  # refused, such as late ones
         results = bench.stop()
     config = '[disturbance]\npreset = "bench"\n[control]\ntilt_gain = 0.5\ngain = 0.2\n'
     direct = loop(folder, "--no-record", "--rate", "500", "--duration", "60", config=config)

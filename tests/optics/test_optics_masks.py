@@ -125,7 +125,7 @@ def test_layouts_are_read_from_files(tmp_path, monkeypatch):
         ({"layouts": {"x": 3}}, "layout x"),
     ],
 )
-def test_errors_of_damaged_layout_files_have_their_path(tmp_path, content, message):
+def test_errors_name_the_path_of_a_damaged_layout_file(tmp_path, content, message):
     path = written(tmp_path, content)
     with pytest.raises(DataFileError, match=message) as caught:
         load_layout(str(path))

@@ -40,7 +40,7 @@ def test_a_long_table_prints_selected_rows_and_agrees_with_simulation():
     table = committed("tolerance")
     assert all(CASES["tolerance"].is_printed(row) for row in table["rows"])
     longer = table | {
-        "rows": [*table["rows"], table["rows"][0] | {"quantity": "drift of Z15 tetrafoil 45, V = 8, 1e-09"}]
+        "rows": [*table["rows"], table["rows"][0] | {"quantity": "drift of Z15 tetrafoil 22.5, V = 8, 1e-09"}]
     }
     assert f"{len(table['rows'])} of {len(longer['rows'])} rows" in to_text(longer)
     checked = [row for row in table["rows"] if "at its tolerance" in row["quantity"]]

@@ -64,7 +64,7 @@ def few():
         tables = run(
             ("table1", "table2", "table3", "table4", "photometry"), Context(FEW_TRIALS, jobs=2, sensors=(SAM,))
         )
-        # Bar and holes are aperture masks.
+        # The bars and holes of this table are aperture masks themselves; zwfs is a sensor of another kind.
         tables += run(["conditioning"], Context(FEW_TRIALS, jobs=2, sensors=("zwfs",)))
     return {table["table"]: table for table in tables}
 
@@ -111,7 +111,7 @@ def test_the_document_is_rendered_from_its_results(committed):
 def test_a_table_of_one_sensor_agrees_with_the_committed_one(few, committed, name):
     others = {each[0] for each in compare(few[name], committed[name])}
     own = {row["name"] for row in few[name]["rows"]} & {row["name"] for row in committed[name]["rows"]}
-    # The input of Table 3 is named after the pupil's first sensor, which is another one in the complete table.
+    # Table 3's input rows are named after the first sensor computed with that pupil: in the complete table not SAM.
     assert others == {row["name"] for row in few[name]["rows"] + committed[name]["rows"]} - own
     assert (SAM in own) == (name in ("table2", "table3", "table4"))
     assert ("zwfs" in own) == (name in ("conditioning", "photometry"))
@@ -134,7 +134,7 @@ def test_the_committed_conditioning_confirms_section_4_of_the_paper(committed):
     assert holes == sorted(holes, reverse=True)
 
 
-def test_table3_is_better_than_the_paper_with_few_wavefronts(few):
+def test_table3_of_few_wavefronts_is_better_than_the_paper(few):
     assert {row["estimator"] for row in few["table3"]["rows"]} == {None, *ESTIMATORS}
     for modes in (14, 20):
         pinv, weighted, _, iterated = (find(few["table3"], SAM, RMS, modes, estimator) for estimator in ESTIMATORS)
@@ -289,7 +289,7 @@ def test_every_figure_agrees_with_the_committed_one(committed):
 
 
 FIGURE_DRAWS = {"fig1": REALISATIONS, "fig7": REALISATIONS, "fig9": SCREENS}
-"""Number of draws of each figure whose committed standard errors are from fewer draws than trials."""
+"""Number of draws behind the committed standard errors of a figure, where it is below the number of trials."""
 
 
 def _unexplained(coefficient):
@@ -314,7 +314,7 @@ TABLE3 = {
     (f"bowtie:{DEFAULT_SAM}", "pinv"): (4.6e-4, 6.8e-4),
     ("clowfs", "pinv"): (1.3e-3, 2.3e-3),
 }
-"""Largest rms residual of 14 and of 20 modes, waves, by sensor and estimator."""
+"""Upper bounds of the rms residual of 14 and of 20 modes, waves, by sensor and estimator."""
 
 
 @pytest.mark.parametrize(("name", "estimator"), TABLE3)

@@ -68,7 +68,7 @@ def test_tilt_per_axis_counts_only_the_axes_among_the_modes() -> None:
     assert (found["tilt_disturbance_mas"], found["tilt_residual_mas"]) == pytest.approx((3.0, 1.5))
 
 
-def test_the_costliest_modes_are_named_although_the_disturbance_adds_no_contrast() -> None:
+def test_the_modes_that_add_most_contrast_are_named_even_without_a_disturbance_in_the_dark_zone() -> None:
     run = statistics()
     run.add(truth(1.0), 0.0, np.arange(3))
     assert [*run.wavefront().values()][-2:] == ["focus", pytest.approx(2 / 3)]
@@ -126,14 +126,14 @@ def test_camera_reports_each_change_of_habitual_lateness() -> None:
             camera._last_frame = sequence + late
             camera._published_ns[sequence % len(camera._published_ns)] = sequence, 0
             put(sequence)
-    states.put(wire.MirrorState(frame_sequence=sequence + 1).SerializeToString())  # its driver failed
+    states.put(wire.MirrorState(frame_sequence=sequence + 1).SerializeToString())  # after a fault of the driver
     camera._drain()
     camera._service.beat()
     assert listener.events()[1:] == ["COMMANDS_LATE", "COMMANDS_IN_TIME", "COMMANDS_LATE"]
     assert camera._lateness.total == 4 * WINDOW
 
 
-def test_a_call_of_a_slow_camera_waits_half_a_second_at_most() -> None:
+def test_expose_of_a_slow_camera_waits_half_a_second_at_most() -> None:
     camera = camera_of(load(None, {"camera.rate_hz": 0.5}))
     camera.join(Listener(FakeClock()).service("camera"))
     camera.start()
@@ -141,7 +141,7 @@ def test_a_call_of_a_slow_camera_waits_half_a_second_at_most() -> None:
 
 
 @pytest.mark.parametrize(("lockstep", "truths_per_block"), [(True, 1), (False, 10)])
-def test_every_frame_has_its_truth_in_order_and_at_once_in_lockstep(
+def test_the_truth_of_every_frame_is_published_in_order_and_in_lockstep_at_once(
     monkeypatch: pytest.MonkeyPatch, lockstep: bool, truths_per_block: int
 ) -> None:
     """At 1 kHz the truths of ten frames are computed together; the end of the run publishes the rest."""

@@ -22,7 +22,7 @@ _SOCKET = "unixsock-stream"
 _DISPLAY_HZ = 40.0  # a viewer draws 30 images a second, each from a new message
 _BATCH_BYTES = 65535  # zenoh's default
 _SMALL_BATCH_BYTES = 16384  # of a monitor: each message that it keeps occupies a whole receive buffer
-_OPEN_MS = 2000  # a closing session waits this long for a process that is stopped; zenoh's default is 10 s
+_OPEN_MS = 2000  # limit of a link's opening; closing waits as long for a suspended process. zenoh's default is 10 s
 _SPARE_BUFFERS = 1024  # of a monitor; otherwise zenoh allocates and clears one for every message
 _PRIORITIES = ("real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background")
 
@@ -30,7 +30,7 @@ _kept = threading.local()
 
 
 def keep_thread_state() -> None:
-    """Keep Python's state of this thread of zenoh from one callback to the next.
+    """Keep the Python state of this zenoh thread from one callback to the next.
 
     Otherwise each callback creates and destroys it, with a memory mapping and page faults: a quarter of the time of a
     round trip over the bus.
@@ -43,8 +43,8 @@ def keep_thread_state() -> None:
 def prevent_slow_closing(session: zenoh.Session) -> None:
     """Set options of this process's TCP sockets after each new link of a session, so that closing a link never blocks.
 
-    SO_LINGER is turned off. With zenoh's 10 s, closing the link of a process that is stopped blocks the receive thread
-    for 10 s, and no request is answered meanwhile. The kernel still sends what was written.
+    SO_LINGER is turned off. With zenoh's 10 s, closing the link of a suspended process (SIGSTOP) blocks the receive
+    thread for 10 s, and no request is answered meanwhile. The kernel still sends what was written.
 
     Across hosts, TCP_USER_TIMEOUT is set to zenoh's link lease. Otherwise a link that was cut while data waited in its
     buffer is not closed until the network is back and the kernel sends again, up to two minutes later.
@@ -121,7 +121,7 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
             # No gain at the sizes of our messages, and a receiver descheduled for 100 ms loses messages silently.
             "shared_memory": {"enabled": False},
         },
-        # Monitors, which connect by Unix socket, get these topics at display rate: sending takes the loop's time.
+        # Monitors, which connect by Unix socket, get these topics at display rate: sending costs the loop time.
         "downsampling": [
             {"id": "monitor", "flows": ["egress"], "messages": ["put"], "link_protocols": [_SOCKET], "rules": throttled}
         ],

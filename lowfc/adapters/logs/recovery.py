@@ -27,7 +27,7 @@ class Recovery:
         finished: whether the original log had been finished.
         recovered: the new log; None if the original is intact.
         messages: number of messages in the new log.
-        unreadable: number of messages left out because their declaration was damaged.
+        unreadable: number of messages left out because the record of their channel or schema was damaged.
         damage: damaged stretches that were left out.
     """
 
@@ -53,7 +53,9 @@ class Recovery:
             return f"{self.log} is intact; {advice}"
         lines = [f"left out {damage_in_words(damage)}" for damage in self.damage]
         if self.unreadable:
-            lines.append(f"left out {counted(self.unreadable, 'message')}: the declaration was in a damaged chunk")
+            lines.append(
+                f"left out {counted(self.unreadable, 'message')}: the record of their channel or schema was damaged"
+            )
         if not self.finished:
             lines.append(f"{self.log} had not been finished")
         return "\n".join([*lines, f"{self.recovered}: {counted(self.messages, 'message')}"])

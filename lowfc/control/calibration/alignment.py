@@ -1,10 +1,10 @@
 """Placement of a real sensor's image relative to the computed one: scale, centre, rotation, parity.
 
-A rotation by 180 degrees does not change the image of a flat wavefront if the pupil is symmetric about its centre or
-has no phase, so the reference image alone leaves this ambiguity. In the wrong orientation, odd modes such as tip and
-tilt have the opposite sign (all modes, if the pupil has no phase): a poke of an odd mode shows the right orientation.
-If a reflection does not change the image either, as without a mask in the relay pupil, pokes of both tip and tilt are
-needed. If the image is circular, only these pokes show the rotation.
+A rotation by 180 degrees does not change the image of a flat wavefront if the field in the pupil (behind its mask) is
+symmetric about its centre or real, so the reference image alone leaves this ambiguity. In the wrong orientation, odd
+modes such as tip and tilt have the opposite sign (all modes, if the field is real): a poke of an odd mode shows the
+right orientation. If a reflection does not change the image either, as without a mask in the relay pupil, pokes of
+both tip and tilt are needed. If the image is circular, only these pokes show the rotation.
 """
 
 from dataclasses import dataclass, replace

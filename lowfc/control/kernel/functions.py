@@ -16,7 +16,8 @@ def scan(
     """Products of one block of a frame with R, in one pass over its counts.
 
     `counts`, `used` and `dark` are this block's part of `pixels`, `good` and `dark` in `measure`; `row` is the index in
-    `tiles` of the block's first row. The products, not yet normalised, are in `sums_nm` (modes rounded up to five,).
+    `tiles` of the block's first row. The products, not yet normalised, are in `sums_nm` (padded,):
+    the number of modes, rounded up to a multiple of five.
 
     Returns:
         Sum of the used counts, and the highest used count.
@@ -77,8 +78,8 @@ def measure_blocks(
 ) -> None:
     """`scan` the blocks from `first` to `last`, exclusive, so that several threads can share a frame.
 
-    The results are written to `sums_nm` (blocks, modes rounded up to five) and `totals` (blocks, 2): sum of the used
-    counts, and the highest used count. Each thread has its own `scratch`; the other arguments are as in `measure`.
+    The results are written to `sums_nm` (blocks, padded) and `totals` (blocks, 2): sum of the used counts, and the
+    highest used count. Each thread has its own `scratch`; the other arguments are as in `measure`.
     """
     block = scratch.size
     for number in range(first, last):
@@ -102,15 +103,16 @@ def measure(
     least_dn: float,
     error_nm: Single,
 ) -> float:
-    """Modal errors of a frame in one pass over its counts.
+    """Measured modes R (I - I0) of a frame in one pass over its counts.
 
     Args:
         pixels: (pixels,) counts, DN; empty if `measure_blocks` has filled the sums and totals.
         good: (pixels,) all bits set for a used pixel, else 0.
         dark: (pixels,) DN.
-        tiles: (blocks x modes rounded up to five, block) R, one block of pixels after the other, padded with zeros.
+        tiles: (blocks x padded, block) R, one block of pixels after the other, padded with zeros; `padded` is the
+            number of modes, rounded up to a multiple of five.
         scratch: (block,) overwritten.
-        sums_nm: (blocks, modes rounded up to five) overwritten, or the sums if `pixels` is empty.
+        sums_nm: (blocks, padded) overwritten, or the sums if `pixels` is empty.
         totals: (blocks, 2) overwritten, or the totals if `pixels` is empty.
         reference_nm: (modes,) R I0.
         full_well: lowest count of a saturated pixel.
@@ -167,14 +169,14 @@ def respond(
     Args:
         measured_nm: (modes,) result of `measure`.
         seen_nm: (modes,) command seen in the exposure.
-        shift_nm: (modes,) shift by the channels seen in the exposure.
+        shift_nm: (modes,) the channels' shift of the sensor's zero point during the exposure.
         target_nm: (modes,) target of the loop.
         previous_command_nm: (modes,) last modal command.
         integrator: (3, modes) gain, fraction of the command that is kept, and limit, as in `Integrator.rows`.
         x: (states,) state of a linear law; empty for the integrator, like `transition` and `output`.
-        transition: (states, states + 2 modes) F, G and U of a linear law, side by side.
-        output: (modes, states) K.
-        from_error: whether the law's signal is the error, not the pseudo-open-loop modes.
+        transition: (states, states + 2 modes) F, G and U of a `LinearLaw`, side by side.
+        output: (modes, states) K of the `LinearLaw`.
+        from_error: whether the law's signal is the error, not the pseudo-open-loop modes minus the target.
         shapes: (modes, actuators) nm of surface per nm of wavefront.
         added_nm: (rows, columns) channels, nm of surface.
         previous_nm: (rows, columns) actuators of the last command, nm of surface.

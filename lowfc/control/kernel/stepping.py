@@ -60,7 +60,7 @@ def _fused(
             return None
         law, x = law_runner.law, law_runner.x
         matrices, from_error = (law.joined, law.output), law.signal == "error"
-    shift_nm = target_nm = tables.no_modes
+    shift_nm = target_nm = tables.no_shift
     channels_nm = tables.no_channels
     if channels is not None:
         shift_nm = seen_nm(loop.delay_weights, channels.shifts_nm)

@@ -13,7 +13,7 @@ KernelName = Literal["numpy", "fused"]
 KERNELS: tuple[KernelName, ...] = get_args(KernelName)
 FUSED: Final = "fused"
 BLOCK = 6400
-"""Most pixels per block: 25.6 kB as float32, which fits into an L1 data cache of 32 to 48 kB."""
+"""Largest number of pixels in a block: 25.6 kB as float32, which fits into an L1 data cache of 32 to 48 kB."""
 DARK_MARGIN = 1e-3
 """Margin above the lowest allowed flux, as a fraction of the expected flux: within it, where rounding matters, the
 reference step decides whether a frame is dark."""
@@ -51,7 +51,8 @@ class Tables(NamedTuple):
         full_well: lowest count of a saturated pixel; above all counts if no pixel can be saturated.
         margin_dn: `DARK_MARGIN` in DN.
         shapes: (modes, actuators) nm of surface per nm of wavefront.
-        no_modes: (modes,) zeros, like `no_states` (0,), `no_law` (0, 0) and `no_channels` (rows, columns).
+        no_shift: (modes,) zeros for `respond` without channels or offset; `no_channels` (rows, columns) likewise.
+        no_states: (0,), for `respond` without a linear law; `no_law` (0, 0) likewise.
     """
 
     measure: Callable[..., float]
@@ -67,14 +68,14 @@ class Tables(NamedTuple):
     dark_sum_dn: float
     margin_dn: float
     shapes: Single
-    no_modes: Single
+    no_shift: Single
     no_states: Single
     no_law: Single
     no_channels: Single
 
     @classmethod
     def of(cls, kernel: Kernel, calibration: Calibration, reference_nm: Single) -> "Tables | None":
-        """Tables of a calibration; None if the kernel has no compiled functions, or the calibration has no pixels."""
+        """Tables of a calibration; None without compiled functions, pixels or modes."""
         modes, pixels = calibration.reconstructor.shape
         if kernel.measure is None or kernel.respond is None or not modes * pixels:
             return None
@@ -96,7 +97,7 @@ class Tables(NamedTuple):
             dark_sum_dn=float(calibration.dark.astype(np.float64) @ calibration.good),
             margin_dn=DARK_MARGIN * calibration.flux_dn,
             shapes=single(calibration.modes_to_actuators.T),
-            no_modes=np.zeros(modes, np.float32),
+            no_shift=np.zeros(modes, np.float32),
             no_states=np.zeros(0, np.float32),
             no_law=np.zeros((0, 0), np.float32),
             no_channels=np.zeros(calibration.grid, np.float32),

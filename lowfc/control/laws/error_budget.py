@@ -26,13 +26,13 @@ _DEGENERATE = 1e-7  # regressors: singular values below this fraction of the lar
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One term: variance of the true residual (modes,), and its standard error if it is a difference."""
+    """One term: variance of the true residual (modes,), and its standard error if it is a difference of variances."""
 
     variance_nm2: Array
     error_nm2: Array | float = 0.0
 
     def total(self, modes: Mask) -> tuple[float, bool]:
-        """Rms in nm of some of the modes (modes,), and whether it was detected; if not, the rms is an upper limit."""
+        """Rms in nm over the modes selected by a mask (modes,), and whether it was detected; if not, an upper limit."""
         variance = float(self.variance_nm2[modes].sum())
         error = float(np.sqrt((np.broadcast_to(self.error_nm2, self.variance_nm2.shape)[modes] ** 2).sum()))
         if error == 0 or variance > DETECTED_SIGMAS * error:
@@ -71,7 +71,7 @@ def sensor_noise(
 
 
 def white_noise(law: LinearLaw, noise_nm: Array, timing: Timing) -> Term:
-    """Residual from noise of the modes (modes,) that is independent from frame to frame, averaged as in `lag`."""
+    """Residual from white measurement noise (modes,); as in `lag`, a mean over all time or over starts of exposures."""
     return Term(noise_nm**2 * noise_gain(law, continuous=timing.held > 0))
 
 
@@ -84,9 +84,10 @@ def lag(law: LinearLaw, disturbance: Spectrum, mean_nm: Array, timing: Timing) -
 
 
 def lag_under_noise(law: LinearLaw, measured: Spectrum, mean_nm: Array, timing: Timing) -> Term:
-    """The residual of `lag`, from spectrum and mean (modes,) of measurements: means over exposures, plus white noise.
+    """The residual of `lag`, computed from the spectrum and the mean (modes,) of measurements.
 
-    The noise, the floor of the spectrum, is subtracted.
+    A measurement is the mean of the disturbance over an exposure, plus white noise. The noise, the floor of the
+    spectrum, is subtracted.
     """
     exposed = np.abs(mean_over(_omega(law, measured), timing.exposure)) ** 2
     passed = _passed(law, measured, timing) / exposed[:, None]

@@ -29,7 +29,7 @@ _NAMES = (
     "secondary astigmatism 0",
     "secondary astigmatism 45",
     "tetrafoil 0",
-    "tetrafoil 45",
+    "tetrafoil 22.5",
     "secondary coma x",
     "secondary coma y",
     "secondary trefoil x",
@@ -48,7 +48,7 @@ def mode_name(noll: int) -> str:
 def mode_group(noll: int) -> str:
     """The name without the mode's direction: "coma" for both comas."""
     name = mode_name(noll)
-    return name.rsplit(" ", 1)[0] if name.endswith((" x", " y", " 0", " 45")) and noll <= len(_NAMES) else name
+    return name.rsplit(" ", 1)[0] if name.endswith((" x", " y", " 0", " 45", " 22.5")) and noll <= len(_NAMES) else name
 
 
 def noll_to_orders(noll: int) -> tuple[int, int]:

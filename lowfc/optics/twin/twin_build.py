@@ -33,8 +33,8 @@ def build(
         progress: Called with the number of steps done and the total.
 
     Raises:
-        ValueError: The focal-plane mask is not symmetric, or complex with an aperture mask; or the optics do not allow
-            `spec`.
+        ValueError: The focal-plane mask is not symmetric, or complex with an aperture mask; or the rank of
+            `spec` exceeds that of the optics.
     """
     mask = sensor.focal_mask
     if mask.shape[0] % 2 or not (np.array_equal(mask, mask[::-1]) and np.array_equal(mask, mask[:, ::-1])):
@@ -49,9 +49,9 @@ def build(
     area_weights = _adjoint(to_samples, sensor.pupil > 0.5).ravel()[used]
     points, to_pixels = _intensity_sampling(sensor, spec, max(scales))
     area = np.count_nonzero(mask) / sensor.samples_per**2
-    # Two thirds of the modes are degrees of freedom of the light, proportional to the mask's area; a third is for the
-    # mask's edge. An aperture mask blurs the contribution of the faintest modes; without one, a third more modes are
-    # needed. A pupil that is bright up to its edge excites the faintest modes and needs a tenth more.
+    # Two thirds of the singular modes are degrees of freedom of the light, proportional to the mask's area; a third is
+    # for the mask's edge. An aperture mask blurs the contribution of the faintest ones; without one, a third more are
+    # needed. A pupil that is bright up to its edge excites the faintest ones and needs a tenth more.
     needed = spec.rank if isinstance(sensor.relay, ApertureMask) else 4 * spec.rank / 3
     if sensor.pupil.mean() > 0.5:
         needed *= 1.1
@@ -85,7 +85,7 @@ def build(
 
 
 def _adjoint(to_samples: Array, weights: Mask) -> Array:
-    """Weights on the square grid of nodes equivalent to these weights on values interpolated at the pupil's samples."""
+    """Transfer weights from the pupil's samples to the nodes: sums of interpolated values are sums of node values."""
     return np.asarray(to_samples.T @ weights.astype(np.float64) @ to_samples)
 
 
@@ -106,7 +106,8 @@ def _intensity_sampling(sensor: Sensor, spec: TwinSpec, scale: float) -> tuple[I
 def _leading_modes(matrix: Array, rank: int) -> Array:
     """Left singular vectors (rows, rank) of the largest singular values.
 
-    They are eigenvectors of the smaller of M M' and M' M, which loses precision only below 1e-8 of the largest value.
+    They are computed from eigenvectors of the smaller of M M' and M' M, which loses precision only below 1e-8 of the
+    largest value.
     """
     import scipy.linalg
 

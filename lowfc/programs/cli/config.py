@@ -118,7 +118,7 @@ def config_zenoh(
     run: AnyRun = None,
     make: Annotated[
         bool,
-        typer.Option("--make", help=f"Create the run if it does not exist; without --run, the run `{DEFAULT_RUN}`."),
+        typer.Option("--make", help=f"Create the run if it does not exist; its name without --run: {DEFAULT_RUN}."),
     ] = False,
 ) -> None:
     """Print the zenoh configuration with which your own program joins a run in a role.
@@ -142,5 +142,5 @@ def config_zenoh(
         if created is not None:
             created.remove()
         raise BusError(f"run {joined.run_id!r} has no role {role!r}; its roles are {', '.join(run_roles)}")
-    HostClock()  # writes the clock offset to a file that the program reads
+    HostClock()  # writes the clock offset to a file that the user's program reads
     typer.echo(json.dumps(session_config(links, role), indent=2))

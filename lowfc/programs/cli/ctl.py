@@ -1,4 +1,4 @@
-"""`lowfc ctl`: one command for each request of `lowfc.client.requests`, with the request's fields as arguments."""
+"""`lowfc ctl`: a command for each request of `lowfc.client.requests` that has an example; its fields are arguments."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -55,7 +55,7 @@ def frame_count(word: str) -> int:
 
 
 def bench_value(word: str) -> bool | float | str:
-    """Parse a bench value: true or false in any case, a number, or else a text."""
+    """Parse a bench value: `true` or `false` in upper or lower case, a number, or else a text."""
     if word.lower() in ("true", "false"):
         return word.lower() == "true"
     try:
@@ -246,7 +246,7 @@ _SPECIAL: dict[str, _Command] = {
     "load": _load,
     "law": _law,
 }
-"""Commands of requests that need more than their declared fields, or print more than the reply."""
+"""Functions for the requests whose arguments do not follow from their fields, or that print more than the reply."""
 _BY_FIELDS: dict[tuple[str, ...], Callable[[str], _Command]] = {
     (): _plain_command,
     ("modes", "values"): _values_command,

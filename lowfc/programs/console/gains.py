@@ -1,4 +1,4 @@
-"""The gain knobs: one for all modes, one for each radial order. A knob shows the largest gain of its modes."""
+"""The gain knobs: one for all modes, one for each radial degree. A knob shows the largest gain of its modes."""
 
 import math
 import time
@@ -115,7 +115,7 @@ class Gains(Lines):
 
 
 def knobs(noll: Sequence[int]) -> list[tuple[str, tuple[int, ...]]]:
-    """Name and modes of each knob: all modes, then those of each radial order."""
+    """Name and modes of each knob: all modes, then those of each radial degree."""
     orders: dict[int, list[int]] = {}
     for mode in noll:
         orders.setdefault((math.isqrt(8 * mode - 7) - 1) // 2, []).append(mode)

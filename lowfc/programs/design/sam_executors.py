@@ -1,4 +1,4 @@
-"""Executors for the chains of a search: this process, a pool of local processes, or the workers of a Dask cluster."""
+"""Executors for the independent chains of a mask search: this process, local processes, or workers of Dask."""
 
 import logging
 import multiprocessing
@@ -41,7 +41,7 @@ class Pool(ProcessPoolExecutor):
 
 @contextmanager
 def open_executor(jobs: int, scheduler: str | None) -> Iterator[Executor]:
-    """Open the executor for this number of processes, or of the Dask scheduler if its address is given."""
+    """Open an executor with this number of processes, or that of a Dask scheduler if its address is given."""
     if scheduler is not None:
         with _dask(scheduler) as executor:
             yield executor

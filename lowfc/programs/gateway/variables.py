@@ -1,6 +1,6 @@
 """Process variables of a gateway, independent of its protocol: readings, and writable variables that send requests.
 
-A request is offered if it changes something, has a `lowfc ctl` command, and needs no value, only numbers, or one text.
+A request is offered if it does not only read, has a `lowfc ctl` command, and needs no value, only numbers, or one text.
 It applies to all modes.
 """
 
@@ -34,7 +34,7 @@ Put = Callable[[Client, Any], Answer]
 class Variable(NamedTuple):
     """A variable; its name, in lower case, follows the gateway's prefix.
 
-    `read` is None for a request without a reading of its name, `put` for a reading without a request.
+    `read` is None if a request has no reading of the same name, `put` if a reading has no request of the same name.
     """
 
     name: str

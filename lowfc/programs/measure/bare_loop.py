@@ -1,4 +1,4 @@
-"""A bare loop: an idle loop beside a process of the control loop. If both are late, the host is the cause.
+"""A bare loop: it only sleeps and reads clocks, beside a loop process. If both are late, the host is the cause.
 
 It runs on the processors of that process, in real-time scheduling at a higher priority, so that lowfc does not delay
 it. Halfway between two frames it wakes, notes how late it is, and reads the kernel's counters of processor and process.
@@ -35,11 +35,11 @@ TRACED = (Role.CAMERA, Role.CONTROLLER)
 _TIMEOUT_S = 60.0
 _POLL_S = 0.01
 
-app = new_app("An idle loop beside a process of the control loop.")
+app = new_app("A loop that only sleeps and reads clocks, beside a process of the control loop.")
 
 
 def trace_file(role: str) -> str:
-    """File in the run's directory with the trace of the bare loop beside a role: a row of `Trace` for each waking."""
+    """File in the run's directory with the trace of the bare loop beside a role: a row for each waking."""
     return f"trace-{role}.npy"
 
 

@@ -85,7 +85,7 @@ class Renderer:
 
 
 class RenderThread(threading.Thread):
-    """Draws new messages, thirty times a second, until it is abandoned or fails.
+    """Draws pictures thirty times a second and curves four times, until it is abandoned or fails.
 
     Attributes:
         drawn_s: end of the last drawing, by time.monotonic().
@@ -140,7 +140,7 @@ class RenderThread(threading.Thread):
                 complete_due_s = now_s + (PICTURES_PER_COMPLETE - 0.5) / PICTURES_HZ  # before the rings overflow
             arrived = [self._earlier.popleft() for _ in range(len(self._earlier))]
             for topic, ring in self._rings.items():
-                if complete or topic.latest_only:  # rows are cheaper in large batches
+                if complete or topic.latest_only:  # points of curves are cheaper in large batches
                     arrived += ring.drain()
             for sample in arrived:
                 accumulator.add(sample)

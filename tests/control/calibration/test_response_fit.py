@@ -85,7 +85,7 @@ def test_the_number_of_frames_grows_with_the_square_of_the_signal_to_noise_ratio
     assert frames_for_snr(200, 2.0, 4.0) == 10_000
 
 
-def test_an_exposure_sees_the_rows_played_before_it_by_the_delay() -> None:
+def test_an_exposure_sees_the_rows_played_one_delay_earlier() -> None:
     table = np.arange(1.0, 6.0)[:, None]
     commanded = np.ones(8, np.bool_)
     one_frame = seen_rows(table, np.array([0.0, 1.0]), np.arange(8), commanded)
@@ -320,7 +320,7 @@ def test_poorly_measured_combinations_can_be_truncated_or_damped() -> None:
     one_nm, noll = np.ones(4, np.float32), (2, 3, 4, 5)
     assert "Z4 and Z5" in advice(whole, noll, one_nm) or "Z5 and Z4" in advice(whole, noll, one_nm)
     assert "no regularisation" in advice(whole, noll, 1e6 * one_nm)
-    assert "no regularisation" in advice(whole, noll, np.array([1, 1, 1e6, 1e6]))  # small limits of other modes
+    assert "no regularisation" in advice(whole, noll, np.array([1, 1, 1e6, 1e6]))  # Z2 and Z3 with small limits
     assert "--truncate" not in advice(whole, noll, 1e-9 * one_nm)  # truncation would leave no combination
     for cut in np.linspace(0.01, 0.02, 20):
         with_smallest = whole._replace(singular_values=np.array([1, 0.5, 0.3, cut]))
@@ -353,7 +353,7 @@ def test_a_cycle_with_too_few_usable_frames_is_refused() -> None:
         fractions_of(np.zeros((3, PIXELS)))
 
 
-def test_a_new_dark_mask_or_reference_keeps_the_response_to_the_modes() -> None:
+def test_a_new_dark_or_mask_or_reference_keeps_the_response_to_the_modes() -> None:
     before = calibration()
     good = np.ones(before.good.size)
     good[3] = 0

@@ -1,4 +1,4 @@
-"""Laws on the ideal reaction wheel, whose lines have no width: their residual in continuous time and at instants."""
+"""Residual of laws under the ideal reaction wheel (lines without width), in continuous time and at instants."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ from sim_camera.disturbance import Sampler
 from sim_camera.driver import disturbance_of
 from tools.law_bench import Bench, calibrated, configured, tuned
 
-IDENTIFY, SETTLE, MEASURE = 16_000, 8_000, 8_000
+IDENTIFY, SETTLE, MEASURE = 16_000, 8_000, 8_000  # frames
 
 pytestmark = pytest.mark.slow
 
@@ -37,7 +37,7 @@ def residual_mas(bench: Bench, series: TimeSeries, timing: Timing, *, continuous
 
 
 def residual_between_instants_mas(bench: Bench) -> float:
-    """Residual, mas, over all time in the last frames, from the commands of a loop whose camera images an instant."""
+    """Continuous-time residual, mas, in the last frames, from the commands of a loop with a camera of one instant."""
     sampler = Sampler(disturbance_of(bench.config), (np.arange(8) + 0.5) / 8, bench.config.camera.rate_hz)
     counts = [count_of(step.frame_sequence) for step in bench.steps[-MEASURE:]]
     disturbance_nm = np.array([sampler.at(count) for count in counts[1:]], float)

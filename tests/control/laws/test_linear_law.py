@@ -294,8 +294,8 @@ def test_a_law_unstable_without_frames_or_in_open_loop_is_refused() -> None:
         check_stable(growing, 1.0)
 
 
-def test_margins_of_coupled_modes_are_those_of_the_rotated_loop() -> None:
-    """Rotating the modes and back leaves the loop unchanged: poles and |S| of the rotated law stay the same."""
+def test_a_rotation_of_the_modes_changes_neither_poles_nor_margins() -> None:
+    """The law acts on rotated modes, and its command is rotated back."""
     law = linear(law_of(modes=2), (4, 5))
     rotation = np.array([[0.8, -0.6], [0.6, 0.8]], np.float32)
     rotated = replace(

@@ -1,4 +1,4 @@
-"""Virtual integrators, compared with real loops that have their gains."""
+"""Virtual integrators (parallel loops with other gains), compared with separate loops that have their gains."""
 
 import numpy as np
 

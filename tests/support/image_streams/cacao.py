@@ -1,4 +1,4 @@
-"""Emulation of a CACAO bench: the simulated camera's frames in a stream, the mirror behind channels.
+"""Emulation of a CACAO bench: the simulated camera's frames in a stream, and a mirror with DM channels.
 
 A program outside the run, with a configuration file and a folder of streams as arguments. It writes frames to
 `camnsv`. It writes the sum of the existing channels dm00disp00 to dm00disp11, minus the mean, to `dm00disp`, and

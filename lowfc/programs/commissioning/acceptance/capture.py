@@ -1,4 +1,4 @@
-"""`lowfc acceptance capture-range`: largest static wavefront error from which the loop converges."""
+"""`lowfc acceptance capture-range`: largest tested static wavefront error from which the loop converges."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -56,7 +56,7 @@ def _realtime_share(facts: Facts) -> Check:
         return warning(detail, "sysctl kernel.sched_rt_runtime_us=950000", "SCHED_FIFO is refused to all processes")
     if len(facts.host.usable_cpus()) >= _IN_LOOP:
         return ok(detail)
-    cost = f"a processor whose share is used up stalls for {(period_us - runtime_us) / 1e3:g} ms"
+    cost = f"real-time processes that use up their share of a processor stall for {(period_us - runtime_us) / 1e3:g} ms"
     return note(detail, advice, cost)
 
 
@@ -68,7 +68,7 @@ def _processors(facts: Facts) -> Check:
     named = named_cpus(facts.config)
     if named and (missing := named - facts.completed_trial.cpus):
         return warning(
-            f"{detail}; the configuration also names {ranges(missing)}",
+            f"{detail}; the configuration names {ranges(missing)}, which lowfc may not use",
             "correct realtime.camera_cpus, controller_cpus, mirror_cpus and recorder_cpus",
             "the kernel moves the loop between processors; expect a longer tail of the latencies",
         )
@@ -175,7 +175,7 @@ def _kernel(facts: Facts) -> Check:
         model = re.search(r"\((\w+)\)", facts.host.text_or_nothing("sys/kernel/debug/sched/preempt"))
         model = model or re.search(r"(?:^| )preempt=(\w+)", facts.host.text("proc/cmdline"))
         if model is None:
-            return note(f"{release}, PREEMPT_DYNAMIC; which model is in force is hidden", advice, cost)
+            return note(f"{release}, PREEMPT_DYNAMIC; the preemption model cannot be read", advice, cost)
         detail = f"{release}, PREEMPT_DYNAMIC, {model[1]}"
         return ok(detail) if model[1] == "full" else warning(detail, advice, cost)
     if "PREEMPT" in version:
@@ -219,8 +219,8 @@ def _clock_source(facts: Facts) -> Check:
 @CHECKS.check(
     "synchronisation",
     advice="run chronyd (with rtcsync), ntpd, systemd-timesyncd or phc2sys before the first run after a boot",
-    cost="a step of this clock does not affect the loop, but times in a log have the error of this clock at the first "
-    "run after the boot, and times of two hosts cannot be compared",
+    cost="the first run after a boot sets the clock of all runs to CLOCK_REALTIME: times in logs keep that error, and "
+    "times of two hosts cannot be compared; later steps of CLOCK_REALTIME do not affect the loop",
 )
 def _synchronisation(facts: Facts) -> Check:
     """Whether a daemon synchronises CLOCK_REALTIME, and the error that the kernel reports."""

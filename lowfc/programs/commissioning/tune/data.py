@@ -234,8 +234,8 @@ def _weighting_warnings(state: wire.ControllerState | None, calibration: Calibra
     if not names:
         return []
     return [
-        f"automatic gains weighted the reconstructor for modes that they do not correct ({names}): if these get "
-        "gains, the noise of the others is higher than predicted"
+        f"automatic gains put the power of modes that they do not correct ({names}) into the reconstructor's weights: "
+        "if these get gains, the noise of the others is higher than predicted"
     ]
 
 

@@ -58,7 +58,7 @@ class TunedMode(Result):
     gain_best: float = result_field("best gain", form=".2f")
     achieved_nm: float | None = result_field("achieved", "nm", ".3f")
     predicted_now_nm: float | None = result_field("theory now", "nm", ".3f")
-    kind: str = result_field("tuned to")
+    kind: str = result_field("tuned law")
     predicted_nm: float = result_field("predicted", "nm", ".3f")
     integrator_predicted_nm: float = result_field()
     noise_nm: float = result_field()
@@ -132,7 +132,7 @@ def result_of(data: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tu
     mean_nm = max(data.pol.values, key=len).mean(axis=0)
 
     def with_mean(law: LinearLaw, changing_nm: Array) -> Array:
-        """Rms (modes,) with the part of the disturbance's mean that a leak leaves; the models have no mean."""
+        """Rms (modes,) with what a leak leaves of the disturbance's mean, which the models omit."""
         return np.asarray(np.hypot(changing_nm, mean_nm * margins.rejection(law, np.zeros(1))[0]))
 
     best_nm, integrator_nm = (with_mean(each.law, each.predicted_nm) for each in (best, integrators))
@@ -226,7 +226,7 @@ def _present_law(data: Telemetry) -> tuple[LinearLaw, bool]:
 
 
 def _means(power: Array, omega: Array, edges: Array) -> Array:
-    """Mean power between neighbouring `edges` from power at `omega` (both rad per frame), so that lines are kept."""
+    """Mean power between neighbouring `edges`; `omega` and `edges` in rad per frame. Narrow lines keep their power."""
     total = np.append(0, np.cumsum((power[1:] + power[:-1]) / 2 * np.diff(omega)))
     return np.asarray(np.diff(np.interp(edges, omega, total)) / np.diff(edges))
 

@@ -1,1 +1,1 @@
-"""`lowfc bench`: what recording and the optical model cost on this host."""
+"""`lowfc bench`: the time that recording and the optical model take on this host."""

@@ -59,7 +59,10 @@ def plot_fig2(context: Context, path: Path) -> None:
     plots.draw(path, panels, f"Fig. 2. {sensor.name}: flat wavefront at {optics.wavelength_nm:.0f} nm.")
 
 
-@assuming("The paper gives the reflected light for its own pupil and the disk only. The wedges open by 95 degrees.")
+@assuming(
+    "The paper gives the reflected light for its own pupil and the disk only. "
+    "The two wedges of the bowtie have an opening angle of 95 degrees."
+)
 def fig3(context: Context) -> Iterator[Row]:
     """Sizes and reflected light of the focal-plane masks, Fig. 3."""
     for name in context.names("sam", "bowtie"):
@@ -86,8 +89,8 @@ def plot_fig3(context: Context, path: Path) -> None:
 
 
 @assuming(
-    "lambda/30 rms, full optical chain, no noise; 'normalised to unity' is interpreted as I0's brightest pixel. "
-    "The layout differs from the paper's."
+    "lambda/30 rms, full optical chain, no noise; 'normalised to unity' is interpreted as divided by I0's brightest "
+    "pixel. The layout differs from the paper's."
 )
 def fig4(context: Context) -> Iterator[Row]:
     """Largest change of the image by lambda/30, Fig. 4 and Table 2."""
@@ -154,7 +157,7 @@ def plot_fig10(context: Context, path: Path) -> None:
     plots.draw(
         path,
         panels,
-        f"Fig. 10. One exposure minus the mean of the flat wavefront's: 1 mas in x, {TABLE4_EXPOSURE_S} s, "
+        f"Fig. 10. One exposure minus the noiseless image of a flat wavefront: 1 mas in x, {TABLE4_EXPOSURE_S} s, "
         f"V = {STAR.magnitude}, 20 % band, 1 e- read noise, our own photometry.",
         columns=2,
     )

@@ -16,10 +16,10 @@ def soak(
     """Run the simulated loop for hours and check memory, handles, threads and losses; exit status 1 on growth or loss.
 
     Finished logs are checked for gaps and removed. Slopes are fitted to the last three quarters of the time. Memory
-    grows if its slope exceeds three standard errors and it gains more than 1 MB in that time; handles and threads grow
-    if their median rises. The latency's slope is reported, not judged. The loop must be closed at the end. If the time
-    is too short for a slope, the soak does not pass. Ctrl-C ends it early: the results so far are printed, with exit
-    status 130.
+    grows if its slope exceeds three standard errors and it gains more than 1 MB in that time; handles (open files and
+    sockets) and threads grow if their median rises from the second to the last quarter. The latency's slope is
+    reported, not judged. The loop must be closed at the end. If the time is too short for a slope, the soak does not
+    pass. Ctrl-C ends it early: the results so far are printed, with exit status 130.
 
     Example: lowfc soak --hours 0.5
     """

@@ -1,1 +1,1 @@
-"""Drawing on a rerun stream."""
+"""Drawing on a stream of the Rerun viewer."""

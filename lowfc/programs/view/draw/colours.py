@@ -49,7 +49,7 @@ def diverging(values: npt.NDArray[np.floating]) -> Rgb:
 
 
 def distinct(count: int) -> list[Colour]:
-    """Colours for `count` lines in one plot: seven, then lighter and darker shades of these in turn."""
+    """Colours for `count` lines in one plot: seven, then their lighter and darker shades, then again."""
     return [_shaded(_OKABE_ITO[number % 7], number // 7) for number in range(count)]
 
 
