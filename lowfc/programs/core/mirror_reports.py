@@ -60,7 +60,8 @@ class MirrorReports:
         """Fault of the mirror, as a predicate after "the mirror"; empty if there is none.
 
         A fault counts after two Healths in a row with faults, even different ones: the first Health may predate the
-        last command.
+        last command. Another fault replaces it after two Healths in a row with that fault: a mirror that has just
+        recovered is still without a command.
         """
         now_ns = self._service.clock.host_ns()
         self._due_ns = now_ns + CHECK_PERIOD_NS
@@ -68,7 +69,7 @@ class MirrorReports:
             self._received_ns = now_ns
             before, report = self._health_fault, self._reports.popleft()
             self._health_fault = _fault_in(report) if state.commanded else ""
-            if before or not self._health_fault:
+            if not self._health_fault or (before and (not self._fault or before == self._health_fault)):
                 self._fault = self._health_fault
             if not self._fault and state.loop is not None:
                 shape = MirrorShape(now_ns, state.loop.actuators_nm, state.loop.history_nm[0])
