@@ -92,7 +92,7 @@ def test_a_pair_of_stars_has_the_committed_values():
 
 
 def test_anchors_without_a_loop_have_the_committed_values():
-    rows = [*anchors._hundred_seconds(Context(), SMALLEST), *anchors._against_magnitude(SMALLEST)]
+    rows = [*anchors._hundred_seconds(Context(), SMALLEST), *anchors._added_contrast_rows(SMALLEST)]
     assert agree(rows, "anchors") == len(rows) == 14 + len(tolerance.MAGNITUDES)
 
 

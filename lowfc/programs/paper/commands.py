@@ -17,9 +17,9 @@ TABLES = (
 )
 
 ADDITIONAL = ("anchors", "tolerance")
-"""Additional tables that are not in the paper and not included in `all`."""
+"""Tables that are not in the paper, and that `all` does not include."""
 WITH_FIXED_SENSORS = ("table1", "photometry")
-"""Tables whose sensors are fixed: the paper's, and in photometry the Zernike sensor too."""
+"""Tables whose sensors do not depend on `--sensor`: the paper's sensors, in photometry the Zernike sensor too."""
 
 
 def validate(
@@ -40,7 +40,7 @@ def validate(
         list[str] | None,
         typer.Option(
             help=f"Only this sensor, in all tables and figures but {' and '.join(WITH_FIXED_SENSORS)} (conditioning "
-            "keeps its open circle, bars and holes): sam, bowtie, bowtie:LAYOUT, clowfs, clowfs:MM (its defocus), "
+            "keeps its open circle, bars and holes): sam, bowtie, bowtie:LAYOUT, clowfs, clowfs:MM (defocus in mm), "
             "clowfs_tuned, zwfs, zwfs_tuned, bar, open, lyot, aplc; or a layout, FILE.json or FILE.json:NAME. May be "
             "repeated.",
             show_default=False,
@@ -58,7 +58,7 @@ def validate(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Reproduce the paper's tables and figures; each row has the paper's value, ours, a limit and the assumption.
+    """Reproduce the paper's tables and figures: the paper's values, ours, their limits and the assumptions.
 
     Example: lowfc validate table3 table4 --trials 20
     """

@@ -24,12 +24,13 @@ SEED = 5  # of the steps
 SETTLE = 100
 """Frames waited for after each step."""
 WINDOW = 300
-"""Frames waited for after the last step, in addition to `SETTLE`, and after the removal of the shape."""
+"""Frames waited for after the last step, in addition to `SETTLE`, and after the removal of the shape; twice as many are
+waited for before the first step."""
 STEPS_COMBINED = 5
 """Number of steps combined into one on the channel that does not shift the zero point. There the loop undoes nearly the
 whole step, so fewer steps suffice to measure the fraction."""
 SHIFTED, PLAIN = "dark-hole", FLAT
-"""A channel that shifts the sensor's zero point, and one that does not."""
+"""Names of two channels: `SHIFTED` shifts the zero point of the loop, `PLAIN` does not."""
 GAINS = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
 """Gains of the loop; the fraction depends on them."""
 COMMAND = "lowfc sim-loop --lockstep --rate 1000 --disturbance bench --star-magnitude -2"
@@ -39,11 +40,12 @@ PATIENCE_S = 60.0
 
 @dataclass(frozen=True)
 class ChannelResult:
-    """Result of a channel; arrays (1 + steps, modes), nm rms of wavefront; the first row is before the first step.
+    """Result of a channel, nm rms of wavefront; the first row of the arrays with steps is before the first step.
 
     Attributes:
-        channel_nm: Modes of the channel's shape as the sensor sees them.
-        reaction_nm: The loop's command minus the part that cancels the disturbance, mean of each step's last frames.
+        channel_nm: (1 + steps, modes) modes of the channel's shape as the sensor sees them.
+        reaction_nm: (1 + steps, modes) the loop's command minus the part that cancels the disturbance: mean of the last
+            frames before the next change of the shape.
         residual_nm: (2,) rms of the true residual about its mean, before the first step, and after the last one
             while the shape is applied.
     """
@@ -53,7 +55,7 @@ class ChannelResult:
     residual_nm: Array
 
     def undone(self) -> tuple[float, float]:
-        """Fraction of the steps that the loop undoes, least squares over all steps, and its standard error."""
+        """Fraction of the steps that the loop undoes, by least squares over all steps, and its standard error."""
         steps, reaction = (each - each.mean(axis=0) for each in (self.channel_nm, self.reaction_nm))
         power = float((steps * steps).sum())
         slope = float((steps * reaction).sum()) / power
@@ -72,7 +74,7 @@ class DarkHoleRun:
 def dark_hole(
     folder: Path, step_rms_nm: float, toml: str = "", base_nm: npt.ArrayLike = 0.0, seed: int | None = None
 ) -> DarkHoleRun:
-    """Apply the steps on one channel, remove them, and apply them on the other, in one run of the processes.
+    """Apply the steps on one channel, remove them, and do the same on the other channel, in one run of the processes.
 
     Args:
         folder: Folder of the log.
@@ -95,7 +97,7 @@ def dark_hole(
             while run not in running() and time.monotonic() < deadline_s and process.poll() is None:
                 time.sleep(0.05)
             with Client(run) as loop:
-                marks, channel_modes_nm = apply_steps(loop, step_rms_nm, np.asarray(base_nm))
+                first_frames, channel_modes_nm = apply_steps(loop, step_rms_nm, np.asarray(base_nm))
         except LowfcError as error:
             failure = f"{error}; "
         finally:
@@ -107,17 +109,17 @@ def dark_hole(
     if failure or process.returncode:
         raise LowfcError(f"{failure}output of the loop: {out}{errors}")
     log = folder / json.loads(out)["log"]
-    return DarkHoleRun(channel_results(read_history(LogReader(log)), marks, channel_modes_nm), log)
+    return DarkHoleRun(channel_results(read_history(LogReader(log)), first_frames, channel_modes_nm), log)
 
 
 def apply_steps(loop: Client, step_rms_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], Array]:
     """Apply the steps on a closed loop.
 
     Returns:
-        The first frame of each step and of the removal, by channel; and the modes (1 + steps, modes) of the channel's
-        shape without `base_nm`, as the sensor sees them: before the first step, then after each.
+        The first frame of each step and of the removal, by channel; and the modes (1 + steps, modes) of the shape
+        without `base_nm`, as the sensor sees them, nm rms of wavefront: before the first step, then after each step.
     """
-    marks: dict[str, list[int]] = {}
+    first_frames: dict[str, list[int]] = {}
 
     def wait(frames: int) -> None:
         for _ in loop.steps(frames, patience_s=PATIENCE_S):
@@ -125,37 +127,39 @@ def apply_steps(loop: Client, step_rms_nm: float, base_nm: Array) -> tuple[dict[
 
     wait(2 * WINDOW)
     calibration = loop.calibration()
-    used = np.asarray(calibration.actuators_to_modes.any(axis=0)).reshape(calibration.grid)
+    sensed = np.asarray(calibration.actuators_to_modes.any(axis=0)).reshape(calibration.grid)
     steps = step_rms_nm * np.random.default_rng(SEED).standard_normal((STEPS, *calibration.grid))
-    shapes = np.cumsum(steps * used, axis=0)
+    shapes = np.cumsum(steps * sensed, axis=0)
     for channel, stride, channel_base_nm in ((SHIFTED, 1, 0 * base_nm), (PLAIN, STEPS_COMBINED, base_nm)):
-        marks[channel] = []
+        first_frames[channel] = []
         for shape in shapes[stride - 1 :: stride]:
-            marks[channel].append(loop.channel(channel, shape + channel_base_nm).frame_sequence)
+            first_frames[channel].append(loop.channel(channel, shape + channel_base_nm).frame_sequence)
             wait(SETTLE)
         wait(WINDOW)
-        marks[channel].append(loop.channel(channel, np.zeros(calibration.grid) + channel_base_nm).frame_sequence)
+        first_frames[channel].append(loop.channel(channel, np.zeros(calibration.grid) + channel_base_nm).frame_sequence)
         wait(WINDOW)
     channel_modes_nm = shapes.reshape(STEPS, -1) @ calibration.actuators_to_modes.T.astype(np.float64)
-    return marks, np.vstack([np.zeros(channel_modes_nm.shape[1]), channel_modes_nm])
+    return first_frames, np.vstack([np.zeros(channel_modes_nm.shape[1]), channel_modes_nm])
 
 
-def channel_results(history: History, marks: dict[str, list[int]], channel_modes_nm: Array) -> dict[str, ChannelResult]:
-    """Results of the channels, from the history of a simulated run and the values of `apply_steps`."""
+def channel_results(
+    history: History, first_frames: dict[str, list[int]], channel_modes_nm: Array
+) -> dict[str, ChannelResult]:
+    """Results of the channels, from the history of a simulated run and the values that `apply_steps` returned."""
     truths, sequences = history.true, history.steps.sequence
     assert truths is not None  # noqa: S101  # a simulated loop logs the truth
     reaction_nm = history.steps.command_nm + truths.disturbance_nm
     has_truth = np.isfinite(truths.disturbance_nm[:, 0])
 
-    def before(end: int, frames: int) -> Mask:
+    def last_before(end: int, frames: int) -> Mask:
         return np.asarray(has_truth & (sequences < end) & (sequences >= end - frames))
 
     results = {}
-    for name, changed_at in marks.items():
-        settled = [before(end, 3 * SETTLE // 4) for end in changed_at]
+    for name, changed_at in first_frames.items():
+        settled = [last_before(end, 3 * SETTLE // 4) for end in changed_at]
         means_nm = np.array([reaction_nm[rows].mean(axis=0, dtype=np.float64) for rows in settled])
         residual_nm = [
-            np.sqrt(truths.residual_nm[before(end, WINDOW)].var(axis=0, dtype=np.float64).sum())
+            np.sqrt(truths.residual_nm[last_before(end, WINDOW)].var(axis=0, dtype=np.float64).sum())
             for end in (changed_at[0], changed_at[-1])
         ]
         stride = STEPS // (len(changed_at) - 1)

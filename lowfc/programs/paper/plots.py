@@ -22,12 +22,12 @@ SKY_UNIT = r"$\lambda$/D"
 SKY = (f"x, {SKY_UNIT}", f"y, {SKY_UNIT}")
 PUPIL = ("x, pupil diameters", "y, pupil diameters")
 
-# Okabe and Ito's colours, safe for colour blindness, black first; lines also differ in style and marker.
+# Okabe and Ito's colours, which colour-blind readers can distinguish; curves also differ in line style or marker.
 _COLOURS = ("#000000", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442")
 _STYLES = ("-", "--", "-.", ":")
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 _MAPS = {"log": "inferno", "linear": "inferno", "signed": "PuOr_r"}
-_PANEL_IN = (3.6, 3.3)
+_PANEL_IN = (3.6, 3.3)  # width and height of a panel, inches
 _DPI = 110
 
 
@@ -105,7 +105,7 @@ def curves(
     diagonal: bool = False,
     legend: Literal["upper right", "upper left", "lower left"] = "upper right",
 ) -> Panel:
-    """Lines in one pair of axes; `ticks` are labels of the integers on the x axis."""
+    """Lines in one pair of axes; `ticks` are the labels at x = 0, 1, 2 and so on."""
 
     def panel(_: "Figure", axes: "Axes") -> None:
         if diagonal:

@@ -1,4 +1,4 @@
-"""Figures 1 and 7: effect on the contrast, and estimate, of an aberration of lambda/30 of focus and of coma."""
+"""Figures 1 and 7: an aberration of lambda/30 of focus and of coma, its effect on the contrast, and its estimate."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,20 +26,20 @@ from lowfc.programs.paper.tables.reconstruction import bound_nm2, exposed_e, fit
 
 COMAS = (7, 8)  # Noll indices
 REALISATIONS = 20
-_CORRECTED = (PINV, WEIGHTED_1, WEIGHTED_2)
-_RING = Wedge(4.5, 5.5)
+_CORRECTING = (PINV, WEIGHTED_1, WEIGHTED_2)  # estimators whose corrections are evaluated
+_RING = Wedge(4.5, 5.5)  # radii in lambda/D
 _VIEW = 20  # half width of a picture, lambda/D
 _VIEW_SAMPLES_PER, _FINE_SAMPLES_PER = 6, 10  # per lambda/D
 _CURVE_EDGES = np.arange(0.25, 20.5, 0.5)  # radii between the rings of a contrast curve, lambda/D
-_LIMIT_DRAWS = 400
+_LIMIT_DRAWS = 400  # residuals drawn from the Cramer-Rao bound
 _PAPER_GOAL = 1e-9  # contrast
-_PAPER_WORSE = 100.0  # contrast with the aberration over contrast of the flat wavefront
+_PAPER_RATIO = 100.0  # contrast with the aberration divided by that of the flat wavefront
 _PAPER_PV_WAVES = 6e-3
 
 
 @dataclass(frozen=True, eq=False)
 class _Aberration:
-    """One aberration (modes,), and its residuals (realisations, modes) for each estimator."""
+    """One aberration (modes,), and the residuals (realisations, modes) after its correction, by estimator."""
 
     sensor: Prepared
     truth_nm: Array
@@ -48,7 +48,7 @@ class _Aberration:
 
 @lru_cache(maxsize=8)
 def _aberrated(context: Context, name: str, coma: int) -> _Aberration:
-    """lambda/30 of focus and of the coma with this Noll index, and the residuals of a sensor's estimates of it."""
+    """lambda/30 of focus and of the coma with Noll index `coma`, and the residuals after correction by one sensor."""
     sensor = prepared(name)
     truth_nm = np.zeros(MODES)
     truth_nm[[NOLLS_14.index(4), NOLLS_14.index(coma)]] = sensor.optics.wavelength_nm / 30.0
@@ -70,7 +70,7 @@ def _aberrated(context: Context, name: str, coma: int) -> _Aberration:
     f"most {REALISATIONS} exposures; limit: the flat wavefront. {BRIGHT} {FULL_CHAIN}"
 )
 def fig1(context: Context) -> Iterator[Row]:
-    """Contrast at 5 lambda/D, Fig. 1(c)."""
+    """Rows of the contrast at 5 lambda/D, Fig. 1(c), and of the contrast between the design's points."""
     for name in context.names("sam"):
         yield from _between_samples(prepared(name))
         for coma in COMAS:
@@ -79,8 +79,8 @@ def fig1(context: Context) -> Iterator[Row]:
             flat, aberrated = _contrast(sensor, 0.0 * aberration.truth_nm), _contrast(sensor, aberration.truth_nm)
             yield Row(row_name, "contrast, flat wavefront", "", flat, _PAPER_GOAL)
             yield Row(row_name, "contrast, aberrated", "", aberrated)
-            yield Row(row_name, "contrast, aberrated / flat wavefront", "", aberrated / flat, _PAPER_WORSE)
-            for key in _CORRECTED:
+            yield Row(row_name, "contrast, aberrated / flat wavefront", "", aberrated / flat, _PAPER_RATIO)
+            for key in _CORRECTING:
                 corrected = context.map(f"{row_name}, {key}", partial(_contrast, sensor), aberration.residuals_nm[key])
                 mean, error = mean_and_error(np.array(corrected))
                 fitted = partial(Row, row_name, modes=MODES, estimator=key)
@@ -89,7 +89,7 @@ def fig1(context: Context) -> Iterator[Row]:
 
 
 def _between_samples(sensor: Prepared) -> list[Row]:
-    """Contrast halfway between the points of the fine grid of the pupil's design, with a flat wavefront."""
+    """Rows of the dark zone's contrast halfway between the points at which the pupil's design limits it."""
     columns = 2 * _VIEW * _FINE_SAMPLES_PER
     image = sensor.star_image(np.zeros(MODES), columns, _FINE_SAMPLES_PER)
     zone = image[wedge_samples(sensor.coronagraph.dark_zone, columns, columns, _FINE_SAMPLES_PER)]
@@ -112,7 +112,7 @@ def plot_fig1(context: Context, path: Path) -> None:
             panels.append(plots.picture(image, title, plots.SKY, _VIEW, (1e-11, 1.0), "contrast", "log"))
         middles = (_CURVE_EDGES[1:] + _CURVE_EDGES[:-1]) / 2.0
         wavefronts = {"flat": flat_nm, "aberrated": truth_nm}
-        wavefronts |= {key: aberration.residuals_nm[key][0] for key in _CORRECTED}
+        wavefronts |= {key: aberration.residuals_nm[key][0] for key in _CORRECTING}
         lines = [plots.Line(key, middles, _curve(sensor, modes_nm)) for key, modes_nm in wavefronts.items()]
         panels.append(
             plots.curves(lines, f"Z{coma}, corrected by {name}", f"radius, {plots.SKY_UNIT}", "contrast", "log")
@@ -173,6 +173,7 @@ def _contrast(sensor: Prepared, modes_nm: Array) -> float:
 
 
 def _curve(sensor: Prepared, modes_nm: Array) -> Array:
+    """Mean contrast (rings,) between the radii `_CURVE_EDGES` with a wavefront (modes,)."""
     return contrast_curve(sensor.coronagraph, sensor.opd_nm(modes_nm), sensor.optics.wavelength_nm, _CURVE_EDGES)
 
 

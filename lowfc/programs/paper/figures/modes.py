@@ -33,13 +33,13 @@ _MODE_TICKS = [str(noll) for noll in NOLLS_14]
 # Least and mean coefficient of determination of the modes.
 _PAPER_R2 = {"sam": (0.95, 0.97), "clowfs": (0.79, 0.90)}
 _PAPER_DEVIATIONS = {"sam": ("linear", 0.1), "clowfs": ("linear", 0.1), "zwfs": ("linear to 0.03 waves", None)}
-"""The paper's deviations from linearity at lambda/20 and at lambda/10; None if it has none."""
+"""The paper's deviations from linearity at lambda/20 and at lambda/10; None where the paper has no value."""
 _PAPER_ERROR_WAVES = 0.01
-_DEVIATION = 0.1  # relative deviation from linearity at the end of the linear range
+_DEVIATION = 0.1  # relative deviation from linearity that ends the linear range
 
 
 def _matched(sensor: Prepared) -> Input:
-    """The interpretation of Sect. 3.1 that matches the input of Table 3."""
+    """The interpretation of Sect. 3.1 whose rms matches the input of Table 3."""
     return next(inputs(sensor, MODES, literal=False))
 
 
@@ -161,7 +161,7 @@ def deviations(estimates: Array) -> Array:
 
 
 def linear_range(deviation: Array) -> float:
-    """Amplitude at which a deviation (amplitudes,) first exceeds 10 %; infinite if it never does."""
+    """Amplitude, waves rms, at which a deviation (amplitudes,) first exceeds 10 %; infinite if it never does."""
     x, y = np.append(0.0, AMPLITUDES), np.append(0.0, deviation)
     above = np.flatnonzero(y > _DEVIATION)
     if not above.size:
@@ -172,7 +172,7 @@ def linear_range(deviation: Array) -> float:
 
 @lru_cache(maxsize=8)
 def _one_wavefront(context: Context, name: str, literal: bool) -> tuple[Array, dict[str, Array]]:
-    """One random wavefront (modes,) in waves, and its estimates."""
+    """One random wavefront (modes,) and its estimates (modes,) by estimator, waves rms."""
     sensor = prepared(name)
     wavelength_nm, matched = sensor.optics.wavelength_nm, _matched(sensor)
     low, high = PAPER_BOUNDS_WAVES if literal else (matched.low, matched.high)
@@ -202,15 +202,15 @@ def _range_rows(context: Context, name: str) -> Iterator[Row]:
         "Pure modes of one sign from 0.005 to 0.15 waves rms, fitted with 14 modes, no noise, images by the twin, "
         "accurate to about 1e-5; deviation: fraction by which a mode's own estimate differs from its amplitude."
     )
-    columns = {
+    indices = {
         "lambda/20": int(np.argmin(np.abs(AMPLITUDES - 0.05))),
         "lambda/10": int(np.argmin(np.abs(AMPLITUDES - 0.1))),
     }
-    in_paper = dict(zip(columns, _PAPER_DEVIATIONS.get(prepared(name).paper_name, (None, None)), strict=True))
+    in_paper = dict(zip(indices, _PAPER_DEVIATIONS.get(prepared(name).paper_name, (None, None)), strict=True))
     for iterations, estimates in zip(ITERATIONS, _pure_modes(context, name), strict=True):
         deviation = deviations(estimates)
         fitted = partial(Row, modes=MODES, estimator=label("pinv", iterations), assumption=assumption)
-        for amplitude, j in columns.items():
+        for amplitude, j in indices.items():
             paper = in_paper[amplitude] if iterations == 0 else None
             quantity = f"relative deviation from linearity at {amplitude}"
             yield fitted(name, f"mean {quantity}", "", float(deviation[:, j].mean()), paper)

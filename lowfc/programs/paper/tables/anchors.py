@@ -37,10 +37,10 @@ LOOP_SENSORS = ("sam", "zwfs_tuned")
 """Sensors for which loops are run."""
 RATE_HZ, MAGNITUDE, EXPOSURE = 1000.0, 2.0, 0.5  # exposure: as a fraction of the period
 OBSERVED_S, CLOSED_S, MEAN_S = 10.0, 24.0, 2.0
-"""Durations: of the loop from which a law is identified, of the loop that is judged, of a mean as in SCExAO."""
+"""Durations of the loop from which a law is identified, of the loop that is judged, and of a mean as in SCExAO."""
 ROMAN_MAS, SCEXAO_MAS = 0.4, {"laboratory": 0.02, "sky": 0.15}
 AVERAGED_S = 100.0
-DRIFT_PM = 20.0
+DRIFT_PM = 20.0  # per root second, in each mode
 REACHED, NOT_REACHED = "reached", "not reached"
 
 ABOUT = """This page compares lowfc with other low-order wavefront control. An anchor is a published value (*paper*) and
@@ -92,7 +92,7 @@ def anchors(context: Context) -> list[Row]:
         rows += _hicat(context)
     rows += _table4(context)
     rows += [row for name in names for row in _hundred_seconds(context, name)]
-    return rows + [row for name in context.names(*tolerance.SENSORS_COMPARED) for row in _against_magnitude(name)]
+    return rows + [row for name in context.names(*tolerance.SENSORS_COMPARED) for row in _added_contrast_rows(name)]
 
 
 def _with_verdict(row: Row, allowed: float | None = None) -> list[Row]:
@@ -108,7 +108,7 @@ def _with_verdict(row: Row, allowed: float | None = None) -> list[Row]:
 
 
 def _pointing(context: Context, name: str) -> list[Row]:
-    """Rows of Roman's milestone and of SCExAO's sensor."""
+    """Rows of the tilt as in Roman's milestone, and of the means of the tilt as by SCExAO's sensor."""
     rows: list[Row] = []
     nm_per_mas = tilt_nm_per_mas(2.0)
     new_row = partial(Row, name, unit="mas", modes=len(NOLLS_14))
@@ -146,7 +146,7 @@ def _pointing(context: Context, name: str) -> list[Row]:
 
 
 def _means_row(new_row: Callable[..., Row], history: History, site: str) -> Row:
-    """Row with the standard deviation of means of the true tilt after the first four seconds."""
+    """Row of the standard deviation of the true tilt's means over `MEAN_S`, after the first four seconds."""
     truths = history.true
     assert truths is not None  # noqa: S101  # a simulated loop logs the truth
     frames = round(MEAN_S * RATE_HZ)
@@ -164,7 +164,7 @@ def _means_row(new_row: Callable[..., Row], history: History, site: str) -> Row:
 
 
 def _quantum_pointing_nm(history: History, name: str) -> float:
-    """Rms tilt per axis, nm, predicted for LQG from this log, with the noise of the quantum limit."""
+    """Residual tilt, nm rms per axis, predicted for LQG on this log's disturbance with noise at the quantum limit."""
     steps = history.steps
     models = identify_modes(time_series(steps.sequence, steps.pol_nm[:, :2]), RATE_HZ)
     scale = (EXPOSURE / RATE_HZ) / (tolerance.EXPOSURE / tolerance.RATE_HZ)
@@ -175,7 +175,7 @@ def _quantum_pointing_nm(history: History, name: str) -> float:
 
 
 def _hicat(context: Context) -> list[Row]:
-    """Row of the fraction of a dark hole's steps that the loop undoes."""
+    """Rows of the fraction of a dark hole's steps that the loop undoes, and of the verdict."""
     context.progress("anchors, a dark hole while the loop runs", 10, 12)
     with tempfile.TemporaryDirectory() as folder:
         undone, error = dark_hole(Path(folder), 2.0, seed=context.seed).channels[SHIFTED].undone()
@@ -196,7 +196,7 @@ def _table4(context: Context) -> list[Row]:
 
 
 def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
-    """Noise of each mode's mean over `AVERAGED_S`, simulated as one exposure with all the light and read noise."""
+    """Rows of the noise of each mode's mean over `AVERAGED_S`, simulated as one exposure with all light and noise."""
     frames = AVERAGED_S * tolerance.RATE_HZ
     sensor, light_e = prepared(name), tolerance.light_e(MAGNITUDE)
     normalised_I0, R = sensor.loop_fit(sensor.I0, sensor.H[:, : len(NOLLS_14)], light_e, tolerance.READ_NOISE_E)
@@ -226,7 +226,7 @@ def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
 
 
 def added_contrast(name: str, magnitude: float, quantum: bool = False) -> float:
-    """Contrast that the residual of drift and noise adds, with integrators of the best gains."""
+    """Contrast added by the residual of drift and noise, with the best gains; `quantum`: noise at the quantum limit."""
     noise = (tolerance.quantum_noise_nm2 if quantum else tolerance.frame_noise_nm2)(name, magnitude)
     step_nm2 = (DRIFT_PM / 1e3) ** 2 / tolerance.RATE_HZ  # variance of the drift in a period
     residual_nm2 = [
@@ -236,7 +236,7 @@ def added_contrast(name: str, magnitude: float, quantum: bool = False) -> float:
     return float(sum(tolerance.contrasts_of(name).added(mode, each) for mode, each in enumerate(residual_nm2)))
 
 
-def _against_magnitude(name: str) -> Iterator[Row]:
+def _added_contrast_rows(name: str) -> Iterator[Row]:
     for magnitude in tolerance.MAGNITUDES:
         yield Row(
             name,
@@ -251,7 +251,7 @@ def _against_magnitude(name: str) -> Iterator[Row]:
 
 
 def plot(context: Context, path: Path) -> None:
-    """Draw the added contrast against magnitude for each sensor (aplc on request) and for the quantum limit."""
+    """Draw the added contrast against magnitude for each sensor (aplc only if requested) and for the quantum limit."""
     magnitudes = np.arange(0.0, 10.5, 0.5)
     names = context.names(*(name for name in tolerance.SENSORS_COMPARED if name != "aplc"))
     lines = [
@@ -264,7 +264,7 @@ def plot(context: Context, path: Path) -> None:
 
 
 def _sensor_toml(name: str) -> str:
-    """Section [sensor] of a configuration file that is used in another folder: a layout file has its whole path."""
+    """Section [sensor] of a configuration file in another folder: the path of a layout file is made absolute."""
     keys = section_of(name).model_dump(exclude_unset=True)
     if keys.get("sam", "").partition(":")[0].endswith(".json"):
         keys["sam"] = str(Path.cwd() / user_path(keys["sam"]))

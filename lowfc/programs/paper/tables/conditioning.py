@@ -69,7 +69,7 @@ def _bar(width: float, angle_deg: float) -> Prepared:
 
 
 def _with_holes(diameter: float) -> Prepared | Row:
-    """The default layout with holes of another diameter, or a row that says that they do not fit into the pupil."""
+    """The default layout with holes of another diameter, or a row that says that they would reach outside the pupil."""
     layout = load_layout(SensorSection().sam)
     name = f"default layout with holes of {100 * diameter:g} %"
     shrunk = sams.Layout(name, layout.purpose, tuple((x, y, diameter) for x, y, _ in layout.holes))
@@ -110,7 +110,7 @@ def _rows(kind: str, mask: Prepared) -> Iterator[Row]:
 
 
 def _noise_rows(mask: Prepared, light_e: float) -> Iterator[Row]:
-    """Rows of the noise of 14 modes, and of its quantum limit; none if the mask cannot distinguish the modes."""
+    """Rows of the noise of 14 modes and of its quantum limit; no rows if the mask cannot distinguish the modes."""
     optics, modes = mask.optics, mask.modes[:14]
     band = gauss_legendre(optics.wavelength_nm, count=4)
 

@@ -37,21 +37,21 @@ from lowfc.programs.paper.tables.pointing import (
 )
 
 PAPER_PEAK = {"sam": 0.0022, "clowfs": 0.0110}
-"""Light on the brightest pixel divided by the light on the sensor."""
+"""The paper's light on the brightest pixel divided by the light on the sensor."""
 PAPER_SIGNAL = {"sam": 0.025, "clowfs": 0.011}
-"""Peak to valley of the signal of 1 mas divided by the brightest pixel."""
+"""The paper's signal of 1 mas of tilt, peak to valley, divided by the brightest pixel."""
 PAPER_SIGNAL_RATIO = 13.0
-"""Signal of 1 mas in electrons: ratio clowfs / sam."""
+"""The paper's signal of 1 mas in electrons: ratio clowfs / sam."""
 PAPER_SCATTER_RATIO = 5.0
-"""Standard deviation of the tilt estimates: ratio sam / clowfs."""
+"""The paper's standard deviation of the tilt estimates: ratio sam / clowfs."""
 PAPER_TILT_PEAK = 5.42e-2
 """Table 2's peak differential intensity of lambda/30 of tilt in x."""
 PAPER_R2 = 0.97
-"""Mean coefficient of determination of the modes."""
+"""The paper's coefficient of determination, mean of the modes."""
 
 
 def photometry(context: Context) -> list[Row]:
-    """Rows of throughputs, peaks, signals, ratios of the sensors, and the paper's inconsistencies."""
+    """Rows of throughputs, brightest pixels, signals of 1 mas, ratios of sensors, and the paper's inconsistencies."""
     sam, clowfs = prepared("sam"), prepared("clowfs")
     rows = [*_throughputs(sam, clowfs)]
     for sensor in (sam, clowfs, prepared("zwfs")):
@@ -212,14 +212,14 @@ def _r2_contradiction(sam: Prepared) -> Iterator[Row]:
     gram, wavelength_nm = sam.gram[:14, :14], sam.optics.wavelength_nm
     wavefronts = next(reconstruction.inputs(sam, 14, literal=False))
     linear = reconstruction.fits(sam, 14)["pinv"]
-    spread = covariance(linear.R, variance_e2(linear.reference_e, TABLE3_READ_NOISE_E)) / wavelength_nm**2
-    spread *= (paper_out / expected_rms(gram, spread)) ** 2
+    covariance_waves2 = covariance(linear.R, variance_e2(linear.reference_e, TABLE3_READ_NOISE_E)) / wavelength_nm**2
+    covariance_waves2 *= (paper_out / expected_rms(gram, covariance_waves2)) ** 2
     bounds = bounds_waves(NOLLS_14, wavefronts.low, wavefronts.high)
     yield Row(
         name,
         "mean R2 of our sensor, noise scaled to the paper's residual of 5.1e-4 waves",
         "",
-        float(expected_r_squared(np.diag(spread), bounds).mean()),
+        float(expected_r_squared(np.diag(covariance_waves2), bounds).mean()),
         PAPER_R2,
         assumption="Errors of modes that look alike through the shaped pupil partly cancel in the residual.",
     )

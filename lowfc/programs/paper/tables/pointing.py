@@ -23,7 +23,7 @@ FITTED = {1: (2, 14, 20), 10: (2, 14)}
 NM_PER_MAS = tilt_nm_per_mas(STAR.diameter_m)
 
 PAPER_PUPIL, PAPER_FOCAL_MASK, PAPER_RELAY_MASK = 0.147, 0.567, 0.091
-"""The paper's throughputs, each relative to the light that reaches the element."""
+"""The paper's throughputs of three elements, each relative to the light that reaches the element."""
 SCALED_PUPIL = "scaled photometry"
 """Name of our own photometry with the transmission of the paper's pupil."""
 
@@ -40,7 +40,7 @@ CENTRED = "paper: 'the estimate distribution is centered on the true value'; pre
 
 @dataclass(frozen=True)
 class Exposure:
-    """Flux in an exposure: its name, electrons of the open circle's light, and how they were determined."""
+    """Flux in an exposure: a name for it, electrons of the open circle's light, and how they were determined."""
 
     name: str
     scale_e: float
@@ -70,7 +70,7 @@ def exposures(sensor: Prepared) -> tuple[Exposure, Exposure]:
     )
 
 
-def dimmed(sensor: Prepared) -> Exposure:
+def with_paper_pupil(sensor: Prepared) -> Exposure:
     """Own photometry with our pupil's transmission scaled to the paper's."""
     own = electrons(STAR, TABLE4_EXPOSURE_S) * PAPER_PUPIL / sensor.budget.pupil
     return Exposure(
@@ -82,7 +82,7 @@ def dimmed(sensor: Prepared) -> Exposure:
 
 
 def fits(sensor: Prepared, exposure: Exposure, mas: int) -> dict[tuple[int, str], Fit]:
-    """Estimators by number of modes and kind."""
+    """The estimators of Table 4 for a tilt of `mas`, by number of modes and kind."""
     return {
         (modes, kind): sensor.fit(modes, exposure.scale_e, TABLE4_READ_NOISE_E, kind, in_band=True)
         for modes, kind in product(FITTED[mas], KINDS)
@@ -90,13 +90,13 @@ def fits(sensor: Prepared, exposure: Exposure, mas: int) -> dict[tuple[int, str]
 
 
 def bound_mas(linear: Fit) -> Array:
-    """Cramer-Rao bounds (2,) of the tilts in x and y at the flat wavefront."""
+    """Least standard deviations (2,) of the tilts in x and y at the flat wavefront, mas: the Cramer-Rao bound."""
     bound = cramer_rao(linear.response_e, variance_e2(linear.reference_e, TABLE4_READ_NOISE_E))
     return np.asarray(np.sqrt(np.diag(bound)[:2]) / NM_PER_MAS)
 
 
 def predicted_mas(linear: Fit, mean_e: Array) -> Array:
-    """Standard deviations (2,) of the estimated tilts in x and y for an image with this mean (pixels,)."""
+    """Standard deviations (2,) of the estimated tilts in x and y, mas, for an image with this mean (pixels,)."""
     spread = covariance(linear.R[:2], variance_e2(mean_e, TABLE4_READ_NOISE_E))
     return np.asarray(np.sqrt(np.diag(spread)) / NM_PER_MAS)
 
@@ -115,7 +115,7 @@ def table4(context: Context) -> list[Row]:
                 linear, mean_e = fits(sensor, exposure, mas), image * exposure.scale_e
                 for key, tilts_mas in _realisations(context, sensor, exposure, linear, mas, mean_e).items():
                     rows += _rows(sensor, exposure, key, linear[key], mas, mean_e, tilts_mas)
-        rows += _dimmed_rows(sensor, dimmed(sensor), images[1])
+        rows += _rows_with_paper_pupil(sensor, images[1])
     return rows
 
 
@@ -164,8 +164,9 @@ def _rows(
     )
 
 
-def _dimmed_rows(sensor: Prepared, exposure: Exposure, tilted_image: Array) -> Iterator[Row]:
+def _rows_with_paper_pupil(sensor: Prepared, tilted_image: Array) -> Iterator[Row]:
     """Predictions with the throughput of the paper's pupil, from the image (pixels,) with a tilt of 1 mas."""
+    exposure = with_paper_pupil(sensor)
     linear = fits(sensor, exposure, 1)
     quantity, paper = f"predicted std of x tilt, 1 mas, {exposure.name}", TABLE4_MAS.get(_paper_name(sensor), {}).get(1)
     for kind in KINDS:

@@ -44,7 +44,7 @@ def label(kind: str, iterations: int) -> str:
 
 @dataclass(frozen=True)
 class Input:
-    """An interpretation of Sect. 3.1: largest coefficients, waves rms, up to degree 2 (`low`) and above it (`high`)."""
+    """An interpretation of Sect. 3.1: largest coefficients, waves rms, to degree 2 (`low`) and above it (`high`)."""
 
     name: str
     low: float
@@ -82,7 +82,7 @@ class Ensemble:
 
     Attributes:
         truth_nm: (trials, modes) true coefficients.
-        estimates_nm: (trials, modes) estimates by each estimator.
+        estimates_nm: (trials, modes) estimates, by estimator.
         bound_nm: Residual rms over the open pupil at the Cramer-Rao bound.
     """
 
@@ -108,7 +108,7 @@ def bound_nm2(sensor: Prepared, modes: int) -> Array:
 
 
 def fits(sensor: Prepared, modes: int, nuisances: bool = False) -> dict[str, Fit]:
-    """The linear estimators of Table 3 by kind; `nuisances` adds one that also fits flux and shear."""
+    """The linear estimators of Table 3, by name; `nuisances` adds one that also fits flux and shear."""
     exposure = (modes, scale_e(sensor), TABLE3_READ_NOISE_E)
     estimators = {kind: sensor.fit(*exposure, kind) for kind in KINDS}
     if nuisances:
@@ -123,7 +123,7 @@ def iterated_nm(sensor: Prepared, linear: dict[str, Fit], image_e: Array) -> dic
 
 
 def ensemble(context: Context, name: str, modes: int, wavefronts: Input, nuisances: bool = False) -> Ensemble:
-    """Draw the wavefronts, image them with the full chain and noise, and estimate them with every estimator."""
+    """Draw wavefronts, image them with the full chain and noise, and estimate them; only `weighted` is iterated."""
     sensor = prepared(name)
     linear, wavelength_nm = fits(sensor, modes, nuisances), sensor.optics.wavelength_nm
     rng = context.rng("table3", modes, wavefronts.name)
@@ -134,8 +134,8 @@ def ensemble(context: Context, name: str, modes: int, wavefronts: Input, nuisanc
     def trial(i: int) -> dict[str, Array]:
         noise = context.rng("table3", name, modes, wavefronts.name, i)
         image_e = exposed_e(sensor, sensor.image(truth_nm[i]), noise)
-        once_nm = {key: estimate(each, image_e) for key, each in linear.items()}
-        return once_nm | iterated_nm(sensor, {"weighted": linear["weighted"]}, image_e)
+        linear_nm = {key: estimate(each, image_e) for key, each in linear.items()}
+        return linear_nm | iterated_nm(sensor, {"weighted": linear["weighted"]}, image_e)
 
     results = context.map(f"table3 {name}, {modes} modes, {wavefronts.name}", trial, range(context.trials))
     bound_nm = trials.expected_rms(sensor.gram[:modes, :modes], bound_nm2(sensor, modes))
@@ -150,7 +150,7 @@ def mean_and_error(values: Array) -> tuple[float, float]:
 def table3(context: Context) -> list[Row]:
     """Rows of Table 3: input, then rms and P-V residual for each sensor, number of modes, input and estimator."""
     rows: list[Row] = []
-    pupils: set[tuple[bytes, int, str]] = set()
+    with_input_rows: set[tuple[bytes, int, str]] = set()
     for name in context.names(*sparse_apertures(), *OTHER_SENSORS):
         sensor = prepared(name)
         in_paper = name in ("sam", "clowfs")
@@ -159,10 +159,10 @@ def table3(context: Context) -> list[Row]:
                 estimated = ensemble(
                     context, name, modes, wavefronts, nuisances=in_paper and wavefronts.name == "matched"
                 )
-                shown = sensor.open.tobytes(), modes, wavefronts.name
-                if shown not in pupils:
+                drawn_on = sensor.open.tobytes(), modes, wavefronts.name
+                if drawn_on not in with_input_rows:
                     rows += _input_rows(sensor, modes, wavefronts, estimated)
-                    pupils.add(shown)
+                    with_input_rows.add(drawn_on)
                 rows += _residual_rows(sensor, modes, wavefronts, estimated)
     return rows
 

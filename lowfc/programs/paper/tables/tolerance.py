@@ -34,10 +34,10 @@ ESTIMATORS: dict[Kind, str] = {"integrator": "integrator, best gain", "lqg": "LQ
 
 CHECKED_SENSORS, CHECKED_MODES, CHECKED_MAGNITUDES = ("clowfs_tuned", "zwfs_tuned"), (4, 8, 11), (2.0, 5.0)
 CHECKED_CONTRAST, SHOWN_CONTRAST = 1e-11, 1e-10
-_FRAMES_PER_TRIAL = 20  # in units of 1 / gain, the loop's time constant; 100 trials give a variance to 3 %
+_FRAMES_PER_TRIAL = 20  # in units of 1 / gain, the loop's time constant; with 100 trials a variance has a 3 % error
 _SHOWN_NOLLS = (2, 4, 8, 11)
 _SHOWN_ENDS = tuple(f"V = {magnitude}, contrast {SHOWN_CONTRAST:g}" for magnitude in (2, 5))
-_LARGEST = 6e-9  # contrast up to which the fourth order is fitted
+_FITTED_CONTRAST = 6e-9  # largest added contrast from which the fourth order is computed
 
 ABOUT = """This page is for the error budget of a telescope. It gives the drift rate of a mode, or the rms of a
 vibration line in it, at which the loop's residual adds a contrast of 1e-10. Both follow from the contrast's quadratic
@@ -94,11 +94,11 @@ def contrasts(pupil: str, focal_radius: float) -> Contrasts:
         )
     quartic = np.zeros(len(NOLLS_14))
     for mode, per_nm2 in enumerate(form.tolist()):
-        amplitude_nm = np.sqrt(_LARGEST / per_nm2)
+        amplitude_nm = np.sqrt(_FITTED_CONTRAST / per_nm2)
         while True:
             modes_nm = amplitude_nm * np.eye(len(NOLLS_14))[mode]
             added = (modal.by_image(modes_nm) + modal.by_image(-modes_nm)) / 2 - flat
-            if added < _LARGEST:
+            if added < _FITTED_CONTRAST:
                 break
             amplitude_nm *= 0.7
         quartic[mode] = max((added - per_nm2 * amplitude_nm**2) / amplitude_nm**4, 0.0)
@@ -142,7 +142,7 @@ def tolerance(context: Context) -> list[Row]:
     from lowfc.programs.paper.tables.star_pair import pair_rows
 
     names = context.names(*SENSORS_COMPARED)
-    context.map("noise", partial(frame_noise_nm2, magnitude=MAGNITUDES[0]), names)  # reports errors before the work
+    context.map("noise", partial(frame_noise_nm2, magnitude=MAGNITUDES[0]), names)  # reports unusable sensors at once
     lines = {kind: tolerated_lines(kind, Line(LINE_HZ, LINE_WIDTH * LINE_HZ, 1.0), RATE_HZ, EXPOSURE) for kind in KINDS}
     rows = [row for each in context.map("tolerance", lambda name: [*_tolerated(name, lines)], names) for row in each]
     rows += _checked(context)
@@ -210,7 +210,7 @@ def is_printed(row: Mapping[str, Any]) -> bool:
 
 
 def plot(context: Context, path: Path) -> None:
-    """Draw the tolerated drift of four modes against magnitude for each sensor (aplc on request)."""
+    """Draw the tolerated drift of four modes against magnitude for each sensor (aplc only if requested)."""
     magnitudes = np.arange(0.0, 10.5, 0.5)
     names = context.names(*(name for name in SENSORS_COMPARED if name != "aplc"))
 
