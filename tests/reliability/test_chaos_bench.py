@@ -56,7 +56,7 @@ def test_how_each_process_ended_is_recorded(sleeping: ChaosBench) -> None:
     assert (option, json.loads(Path(file).read_text())) == ("--fault", {"kind": "dark"})
     for name in (Role.CONTROLLER, Role.RECORDER):
         sleeping.restart(name, ready=False)
-    with sleeping.stopped(Role.CONTROLLER):
+    with sleeping.suspended(Role.CONTROLLER):
         until(lambda: status_of(sleeping.children[Role.CONTROLLER]) == psutil.STATUS_STOPPED)
     until(lambda: status_of(sleeping.children[Role.CONTROLLER]) != psutil.STATUS_STOPPED)
     sleeping.kill(Role.RECORDER)

@@ -31,7 +31,7 @@ from lowfc.programs.launch.sim_loop import children_of, prepare
 
 _POLL_S = 0.02
 _QUIET_FRAMES = 250  # closed-loop frames before a fault: one second at the default rate
-_LAST_HEALTH_S = 0.2
+_LAST_HEALTH_S = 0.2  # time for the last Health of the ended processes to arrive
 SETTLED_FRAMES = 500
 """Closed-loop frames to wait for after a fault: two seconds at the default rate; the last second is judged."""
 PATIENCE_S = 5.0
@@ -53,8 +53,8 @@ class ProcessEnd:
     Attributes:
         name: name of the process.
         status: exit status; negative for a signal.
-        after_s: time from the request that it end until it ended.
-        requested: whether the case ended it, or waited for its end.
+        after_s: time from the signal to stop, or from the start of the wait for the end, until the end; 0 after a kill.
+        requested: whether the case or the end of the bench stopped it, or the case waited for its end.
     """
 
     name: str
@@ -73,10 +73,10 @@ class Outcome:
         settled_ns: time at which the loop had settled, host clock; 0 if it did not settle.
         end_ns: time at which the stop of the processes began, host clock.
         ended: processes that ended.
-        alive: processes that still exist after the end of the case.
+        alive: processes that still exist after the end of the bench.
         killed_ns: times at which a recorder was killed, host clock.
-        mode: last loop mode.
-        lost: messages that the last recorder reports as lost, by key.
+        mode: loop mode of the last step.
+        lost: number of messages that the last recorder reports as missing, by key.
         failure: why the recording failed; empty if it did not.
         residuals_nm: true residuals of the last 250 frames, nm rms over the pupil.
         measurements: values measured by the case, for `--json`.
@@ -99,7 +99,7 @@ class Outcome:
 
 
 class ChaosBench:
-    """A simulated loop with injected faults; `children` and `health` have the present process of each role."""
+    """A simulated loop with injected faults; `children`: newest process of each name; `health`: its last Health."""
 
     def __init__(self, config: Configuration, folder: Path, rng: random.Random, fault: dict[str, Any] | None) -> None:
         """Open a run whose logs go to `folder`; `fault`, if any, is injected into the camera's frames."""
@@ -147,7 +147,7 @@ class ChaosBench:
         self.wait(lambda: self._steps >= last, f"{count} steps")
 
     def await_settled(self, frames: int = SETTLED_FRAMES) -> None:
-        """Wait until this many frames were used with the loop closed; the count restarts if the loop is not closed."""
+        """Wait until this many frames were used with the loop closed; the count restarts when the loop is not closed."""
         self._closed_frames = 0
         timeout_s = WAIT_S + frames / self.config.camera.rate_hz
         self.wait(lambda: self._closed_frames >= frames, f"{frames} good frames with the loop closed", timeout_s)
@@ -165,7 +165,7 @@ class ChaosBench:
         time.sleep(self.rng.uniform(shortest_s, longest_s))
 
     def process(self, role: Role) -> str:
-        """Name of the process with a role; the viewer is started by this call, and writes to a file."""
+        """Name of the process with a role; for the viewer, this call also starts one that writes to a file."""
         if role is Role.VIEWER:
             arguments = ["-m", "lowfc", "view", "--run", self.run.run_id, "--save", str(self.folder / "view.rrd")]
             self._start(program(role, arguments, self.folder / f"{role}.stderr"), ready=True)
@@ -181,8 +181,8 @@ class ChaosBench:
         self._record_end(child, 0.0, requested=True)
 
     @contextlib.contextmanager
-    def stopped(self, name: str) -> Iterator[None]:
-        """Stop a process (SIGSTOP) within the context; continue it (SIGCONT) at its end."""
+    def suspended(self, name: str) -> Iterator[None]:
+        """Suspend a process (SIGSTOP) within the context; continue it (SIGCONT) at the end of the context."""
         self.signal(name, signal.SIGSTOP)
         try:
             yield
@@ -244,9 +244,9 @@ class ChaosBench:
             self.outcome.ended.append(ProcessEnd(child.name, child.status or 0, after_s, requested))
 
     def _receive(self, sample: Sample) -> None:
-        """Store a Health, a true residual or the outcome of a step."""
+        """Store a Health or a true residual, or count a step."""
         topic = topic_of(sample.key)
-        with contextlib.suppress(DecodeError):  # some cases send junk
+        with contextlib.suppress(DecodeError):  # some cases send invalid messages
             message: Any = topic.message.FromString(sample.payload)
             if topic is HEALTH:
                 self.health[message.process] = message

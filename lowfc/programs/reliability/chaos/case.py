@@ -27,12 +27,12 @@ class Case:
         description: description of the fault.
         act: function that injects the fault.
         fault: kind of the fault that the camera is started with; empty for none.
-        config: configuration keys that the case sets.
-        expected: beginnings of the events that must be in the log.
+        config: values that the case sets in the configuration, by key.
+        expected: beginnings of the messages of events that must be in the log.
         allowed: names of events of the level ERROR that may be in the log.
         ends_safe: whether the loop must end in safe mode with a flat mirror, not closed with the former residual.
         is_bad: whether the frame with a given number must be refused; None if all frames may be used.
-        statuses: exit status other than 0 with which a process may end, by process.
+        statuses: exit status other than 0 with which a process may end, by name of the process.
         prints_tracebacks: whether the processes may print tracebacks, from messages that cannot be decoded.
         why_skipped: function that returns why this host cannot run the case; empty if it can.
     """

@@ -81,7 +81,7 @@ def _require_writable(folder: Path) -> None:
     nearest_folder = nearest_existing(folder)
     if not nearest_folder.is_dir() or not os.access(nearest_folder, os.W_OK):
         raise DataFileError(
-            f"no logs can be kept in {folder}: {nearest_folder} is no writable folder; name another with --keep"
+            f"no logs can be kept in {folder}: {nearest_folder} is not a writable folder; name another with --keep"
         )
 
 
@@ -115,7 +115,7 @@ def _wrong(row: dict[str, Any]) -> list[str]:
 
 
 def _recovery(row: dict[str, Any]) -> str:
-    """What the rule on recovery found; empty if it was not checked."""
+    """What the rule on recovery found; empty if this rule was not checked."""
     return str(row["findings"].get("recovery", {}).get("found", ""))
 
 
@@ -162,7 +162,7 @@ def _run(case: "Case", folder: Path, rng: random.Random) -> "Outcome":
 
 
 def configured(case: "Case", folder: Path) -> "Configuration":
-    """The configuration of a case: the loop closed, its log in the case's folder, and the keys of the case."""
+    """The configuration of a case: the loop starts closed, its logs are in `folder`, and the case's values are set."""
     from lowfc.adapters.process.realtime import spread
     from lowfc.contract.configuration import FIXED_GAINS, load
 
@@ -187,7 +187,7 @@ def _result(row: dict[str, Any]) -> str:
 
 
 def render(results: dict[str, Any]) -> str:
-    """The results as text: a line for each case, and below it the rules that did not hold."""
+    """The results as text: a line for each case, and below it failed rules, measurements and the folder of the logs."""
     lines = []
     width = max((len(row["name"]) for row in results["cases"]), default=0)
     for row in results["cases"]:

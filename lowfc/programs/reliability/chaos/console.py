@@ -1,4 +1,4 @@
-"""Chaos case: a console that is flooded with events, stopped and killed."""
+"""Chaos case: a console that is flooded with events, suspended (SIGSTOP) and killed."""
 
 import contextlib
 import os
@@ -24,9 +24,9 @@ from lowfc.programs.reliability.chaos.processes import CommandTimes
 
 PHASE_S = 5.0
 """Duration of each phase."""
-START_S = 60.0
+START_S = 60.0  # longest wait for the console to show the loop
 FLOOD_HZ = 2000
-_STEP_S = 0.02
+_STEP_S = 0.02  # between two looks at the screen, and between two bursts of events
 _SIZE = 30, 100  # rows and columns of the terminal
 _LOOP_MODE = rb"\b(OPEN|CLOSED)\b"
 """Text on the screen once the console shows the loop."""
@@ -87,7 +87,7 @@ class TerminalConsole(contextlib.AbstractContextManager["TerminalConsole"]):
         self.start_s = time.monotonic() - began_s
 
     def cpu_s(self) -> float:
-        """Processor time used so far."""
+        """Processor time that the console has used so far, s."""
         times = psutil.Process(self.process.pid).cpu_times()
         return float(times.user + times.system)
 

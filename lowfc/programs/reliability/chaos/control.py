@@ -34,7 +34,7 @@ def _highest_gain(bench: ChaosBench) -> None:
     client, limiting = bench.client(), limiting_gain(settings(bench.config).delay_frames)
     with contextlib.suppress(RequestRefusedError):
         client.gain(1.01 * limiting)
-        raise CaseFailedError(f"a gain of {1.01 * limiting:.3g} was accepted, although {limiting:.3g} is unstable")
+        raise CaseFailedError(f"a gain of {1.01 * limiting:.3g} was accepted, above the limit of {limiting:.3g}")
     client.gain(STABLE_FRACTION * limiting)
     bench.await_steps(HOLD_FRAMES)
     client.gain(FIXED_GAINS["control.gain"])
@@ -133,7 +133,7 @@ def _restart_in_safe_mode(bench: ChaosBench) -> None:
 
 
 INTERLOCK = {"name": "mask", "value": True, "action": "hold", "max_age_s": 1.0, "when_old": "passes"}
-FLIPS, FLOOD_VALUES, FLOOD_HZ = 40, 4000, 2000
+FLIPS, FLOOD_VALUES, FLOOD_HZ = 40, 4000, 2000  # slow changes of the value; then values in a flood, and their rate
 
 
 @case(
@@ -159,7 +159,7 @@ def _interlock(bench: ChaosBench) -> None:
 
 
 def _acting(client: Client) -> list[str]:
-    """Why each acting interlock acts."""
+    """Reasons of the interlocks that act now."""
     state = client.status().state
     return [] if state is None else [interlock.why for interlock in state.interlocks_acting]
 
@@ -197,7 +197,7 @@ no_latch_case(
 
 
 def _other_clock(bench: ChaosBench, shift_s: int) -> None:
-    """Replace the camera by one with a shifted clock, then by one with the host's clock."""
+    """Replace the camera by one whose clock is ahead by `shift_s`, then by one with the host's clock."""
     normal = bench.children[Role.CAMERA].command
     for command in (["unshare", "--time", "--monotonic", str(shift_s), *normal], normal):
         bench.kill(Role.CAMERA)

@@ -18,7 +18,7 @@ from lowfc.contract.messages import COMMAND, EVENT, HEALTH, MIRROR_STATE, STEP, 
 from lowfc.contract.sequence_gaps import Gaps
 
 FORGED_S = 1
-"""Start time in the sequence of injected messages; it is in 1970, so no process of a run has it."""
+"""Start time, Unix seconds, in the sequence of injected messages: in 1970, when no process of a run started."""
 DECODED = (COMMAND, MIRROR_STATE, STEP, EVENT, TRUTH, HEALTH)
 _NONE = np.zeros((0, 0), np.float32)
 
@@ -45,7 +45,7 @@ class Entry(NamedTuple):
 
     @property
     def frame(self) -> int:
-        """Number of a step's frame since the camera's start."""
+        """Number of the frame of a step, counted from the camera's start."""
         return count_of(self.message.frame_sequence)
 
 
@@ -55,10 +55,10 @@ class Evidence:
 
     Attributes:
         entries: messages of each topic of `DECODED`, in the order of the logs.
-        received: counts of the messages in each finished log, by number of the log, key and start of the publisher.
-            Each log was written by another recorder, which counts losses only while it runs.
-        sent: messages that each publisher reported at its end as sent, by the same keys as `received`.
-        lost: messages that the recorders report as lost, by key.
+        received: message counts in each finished log, by number of the log, key and start of the publisher. Each log is
+            by another recorder, and a recorder counts losses only while it runs.
+        sent: number of messages that each publisher reported at its end as sent, by the same keys as `received`.
+        lost: number of messages that the recorders report as lost, by key.
         unreadable: errors of logs and messages that cannot be read.
         log_ends: time of the last message of each log, ns, and whether the log was finished.
         messages: number of messages in all logs.
@@ -79,14 +79,14 @@ class Evidence:
         return times_ns, np.array([truth.message.residual_rms_nm for truth in truths], np.float64)
 
     def residual_nm(self, begin_ns: int, end_ns: int) -> float:
-        """Root mean square of the true residual between two times; NaN without data."""
+        """True residual between two log times, root mean square, nm; NaN without data."""
         times_ns, residuals_nm = self.residuals_nm()
         within = residuals_nm[(times_ns >= begin_ns) & (times_ns < end_ns)]
         return float(np.sqrt(np.mean(within**2))) if within.size else float("nan")
 
 
 def read(folder: Path) -> Evidence:
-    """Read all logs of a case, in their order."""
+    """Read all logs of a case, in the order of their names."""
     evidence = Evidence()
     for number, path in enumerate(sorted(folder.glob("*.mcap*"))):
         reader, last_ns = LogReader(path), 0

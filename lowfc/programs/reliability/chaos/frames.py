@@ -6,9 +6,9 @@ from lowfc.programs.reliability.chaos.bench import ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, case
 
 FIRST = 600
-"""Index of the first frame with the fault; by then the loop has settled and been quiet for a second."""
+"""Index of the first frame with the fault; by then the loop has been closed for a second."""
 FAULTY_FRAMES = 250
-"""Number of frames with the fault: one second."""
+"""Number of frames with the fault: one second at the default rate."""
 MAX_FRAMES_LATE = 50
 """Largest delay of a frame, in frames."""
 
@@ -30,29 +30,29 @@ _KINDS = (
 )
 
 
-def _wait_for_last(bench: ChaosBench) -> None:
+def _await_faulty_frames(bench: ChaosBench) -> None:
     last = FIRST + FAULTY_FRAMES + MAX_FRAMES_LATE
     bench.wait(lambda: count_of(bench.newest_frame) >= last, f"frame {last}")
 
 
-for _kind, _description, _reason, _used, _lost in _KINDS:
+for _kind, _description, _reason, _used, _may_lose in _KINDS:
     _event = _reason if _reason in ("", "FRAMES_MISSING") else f"FRAMES_REFUSED frames refused: {_reason}"
     case(
         f"frames-{_kind}",
         _description,
         fault=_kind,
         expected=(_event,) if _event else (),
-        allowed=LOST if _lost else (),
+        allowed=LOST if _may_lose else (),
         is_bad=range(FIRST + _used, FIRST + FAULTY_FRAMES).__contains__ if _used < FAULTY_FRAMES else None,
-    )(_wait_for_last)
+    )(_await_faulty_frames)
 case(
     "stuck-actuators",
     "dead and stuck actuators, whose wavefront the modes cannot correct",
     config={"mirror.dead": [500, 501], "mirror.stuck_nm": {"600": 80.0}},
-)(_wait_for_last)
+)(_await_faulty_frames)
 case(
     "saturating",
     "a disturbance beyond the modal limit of tip and tilt",
     config={"disturbance.preset": "step", "disturbance.scale": 6.0, "control.tilt_limit_nm": 20.0},
     expected=("LIMIT_HIT",),
-)(_wait_for_last)
+)(_await_faulty_frames)

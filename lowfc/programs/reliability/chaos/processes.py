@@ -44,7 +44,7 @@ def stop_and_continue(bench: ChaosBench, role: Role, for_s: tuple[float, float] 
     """Stop a process (SIGSTOP), and continue it after a random time in this range."""
     name = bench.process(role)
     bench.pause(0.0, 0.5)
-    with bench.stopped(name):
+    with bench.suspended(name):
         bench.pause(*for_s)
 
 

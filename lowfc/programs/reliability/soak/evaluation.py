@@ -10,18 +10,18 @@ from lowfc.control.loop.wording import counted
 from lowfc.programs.cli.result import table
 
 BLOCKS = 12
-"""Number of means to which a slope is fitted: neighbouring samples are correlated, but means of many hardly are."""
+"""Number of means to which a slope is fitted: neighbouring samples are correlated, means of many samples hardly are."""
 WARM_UP = 0.25
-"""Fraction of the time at the start that is left out, while caches and queues fill."""
+"""Fraction of the time, at its start, that is left out, because caches and queues fill."""
 SIGNIFICANT = 3.0
 """Standard errors above which a slope is significant."""
 MIN_GROWTH_MB = 1.0
-"""Growth over the evaluated time that counts as a leak; the allocator's steps are smaller."""
+"""Growth over the evaluated time above which memory counts as growing; the allocator's steps are smaller."""
 TOO_SHORT = "too short to judge"
 
 
 class Usage(NamedTuple):
-    """Resources of a process at one time."""
+    """Resources of a process at one time; `handles` is the number of open files and sockets."""
 
     time_s: float
     memory_bytes: int
@@ -30,7 +30,7 @@ class Usage(NamedTuple):
 
 
 def slope(times_s: Sequence[float], values: Sequence[float]) -> tuple[float, float] | None:
-    """Change per hour and its standard error, from means of blocks after the warm-up; None if the time is too short."""
+    """Change per hour and its standard error, from means of blocks after the warm-up; None with too few samples."""
     hours, samples = np.asarray(times_s, np.float64) / 3600, np.asarray(values, np.float64)
     later = hours >= hours[0] + WARM_UP * (hours[-1] - hours[0]) if hours.size else hours
     if np.count_nonzero(later) < 2 * BLOCKS:
@@ -57,8 +57,8 @@ def process_statistics(samples: Sequence[Usage]) -> dict[str, Any]:
     if memory_slope is not None:
         mb_per_hour, error = memory_slope
         evaluated_h = (times_s[-1] - times_s[0]) / 3600 * (1 - WARM_UP)
-        leaks = mb_per_hour > SIGNIFICANT * error and mb_per_hour * evaluated_h > MIN_GROWTH_MB
-        checks = {"memory": leaks, "handles": _grew(handles), "threads": _grew(threads)}
+        memory_grows = mb_per_hour > SIGNIFICANT * error and mb_per_hour * evaluated_h > MIN_GROWTH_MB
+        checks = {"memory": memory_grows, "handles": _grew(handles), "threads": _grew(threads)}
         grows, too_short = [name for name, grew in checks.items() if grew], []
     measured = {"memory": [round(mb, 2) for mb in memory_mb], "handles": handles, "threads": threads}
     usage: dict[str, Any] = {}

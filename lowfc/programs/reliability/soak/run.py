@@ -73,7 +73,7 @@ class _Soak:
         self._times = CommandTimes(bench)
 
     def sample(self, now_s: float) -> None:
-        """Sample processes and latency, and check finished logs."""
+        """Sample processes and latency `now_s` seconds after the start, and check finished logs."""
         children = list(self.bench.children.values())
         check(children)
         for child in children:
@@ -121,7 +121,7 @@ class _Soak:
 
 
 def soak_loop(config: Configuration, seconds: float, progress: Callable[[float], None]) -> dict[str, Any]:
-    """Run the loop for this time, or until Ctrl-C; return the results that `lowfc soak --json` prints."""
+    """Run the loop for `seconds`, or until Ctrl-C; return the results that `lowfc soak --json` prints."""
     with tempfile.TemporaryDirectory(prefix="lowfc-soak-") as name:
         logged = config.model_copy(update={"recorder": config.recorder.model_copy(update={"folder": name})})
         bench = ChaosBench(logged, Path(name), random.Random(), None)  # noqa: S311  # nothing secret
