@@ -47,7 +47,7 @@ def view(
     if foxglove:
         other_options = logs, native, web, save, headless_screenshot, seconds, config, as_json, web_port
         if any(other_options) or tab != Tab.OPERATOR or memory_mb != _MEMORY_MB:
-            raise ConfigurationError("--foxglove serves a running loop until Ctrl-C; only --run and --port go with it")
+            raise ConfigurationError("--foxglove serves a running loop until Ctrl-C; use it only with --run and --port")
         from lowfc.adapters.process.clock import HostClock
         from lowfc.programs.view.foxglove_bridge import DEFAULT_PORT, serve_foxglove
 

@@ -25,7 +25,7 @@ APPLICATION = "lowfc"
 _CONTRAST = partial(science.CONTRAST.view, axis_y=science.CONTRAST_AXIS)
 _MODE = partial(rrb.StateTimelineView, origin=loop.MODE, name="Loop mode")
 LIVE_WINDOW_S = 20.0
-"""Time span of a live plot."""
+"""Time span that a live plot shows."""
 
 _PICTURES: dict[str, tuple[str, rrb.VisualBounds2D | None]] = {
     tiles.TILES: ("Status", None),

@@ -47,9 +47,9 @@ MAX_EARLIER_EVENTS = 1000
 _RECORDER_S = 3.0  # time without the recorder's Health after which the recorder counts as absent
 _FILE_S = 60.0  # longest time for the last data to be written to a file
 _POLL_S = 0.1
-_CHECK_S = 1.0
-_FROZEN_S = 3.0  # a longer time between two checks means that this process was stopped meanwhile
-_MAX_RENEWALS = 5  # restarts within `_RENEWALS_S`; after more, the view ends
+_CHECK_S = 1.0  # time between two checks of viewer, render thread and memory
+_FROZEN_S = 3.0  # a longer time between two checks means that this process was suspended meanwhile
+_MAX_RENEWALS = 5  # restarts allowed within `_RENEWALS_S`; a further one ends the view
 _RENEWALS_S = 60.0
 
 
@@ -98,7 +98,7 @@ class LiveView:
                 now_s = time.monotonic()
                 if now_s - checked_s >= _CHECK_S:
                     if now_s - checked_s > _FROZEN_S:
-                        self._resumed_s = now_s  # the render thread could not draw while this process was stopped
+                        self._resumed_s = now_s  # the render thread could not draw while this process was suspended
                     checked_s = now_s
                     self._check(now_s)
         finally:
@@ -136,7 +136,7 @@ class LiveView:
                 self._renew(f"drawing failed: {fault!r}")  # raises a ViewError
 
     def _add_earlier(self, render: RenderThread) -> None:
-        """Add messages published before this view began; in a thread, because a frozen peer answers late."""
+        """Add messages published before this view began; in a thread, because a suspended process answers late."""
         recorder = self.service.last_health.get(Role.RECORDER)
         events_due = not self._earlier_events_requested and (
             recorder is not None or self._recorder_absent(time.monotonic())
@@ -188,8 +188,8 @@ class LiveView:
     def _renew(self, why: str) -> None:
         """Restart with a new viewer on the same ports.
 
-        It raises ViewError after too many restarts, or if the view is written to a file: a file is kept as it is, and
-        cannot be continued.
+        It raises ViewError after too many restarts, or if the view is written to a file: the file is kept, but it cannot
+        be continued.
         """
         if self.viewer is None:
             raise ViewError(f"writing the view to a file failed: {why}")
@@ -212,7 +212,7 @@ class LiveView:
 
 
 def earlier_events(recorder: wire.Health | None, now_ns: int) -> list[Sample]:
-    """The newest events in a recorder's logs; if they cannot be read, an event of the view with the reason.
+    """The newest events in a recorder's logs, and an event of the view for each reason why some or all are missing.
 
     Only chunks with events are read, which takes a second for a log of 4 GB.
     """

@@ -22,14 +22,14 @@ def import_late_modules() -> None:
 class Monitor:
     """Receives through ring buffers, which keep the newest messages: the loop never waits for a monitor.
 
-    `watcher`: state of the run, from which the verdict is made. `steps`: the newest steps; no row before the first.
+    `watcher`: derives the state of the run for the verdict. `steps`: the last steps received; empty before the first.
     """
 
     _query_timeout_s = 0.2
     """Timeout of a query of one topic."""
 
     def __init__(self, bus: Bus, clock: Clock) -> None:
-        """Subscribe."""
+        """Subscribe to the shown topics except the surface."""
         self.watcher, self.steps = Watcher(), StepRows(0).values()
         self._bus, self._clock = bus, clock
         self._rings = {
@@ -43,7 +43,10 @@ class Monitor:
         self._queried_ns = 0
 
     def snapshot(self, now_ns: int, behind_s: float = 0.0) -> Snapshot:
-        """Return the data since the last call; states of new processes are queried, and are in the next snapshot."""
+        """Return the data since the last call; states of new processes are queried, and are in the next snapshot.
+
+        `behind_s`: longest time for which messages may have waited.
+        """
         while self._answers:
             self._accumulator.add(self._answers.popleft())
         for ring in self._rings.values():
@@ -65,5 +68,5 @@ class Monitor:
         return None not in (snapshot.calibration, snapshot.controller)
 
     def _query(self) -> None:
-        """Query the states published earlier."""
+        """Query the last states that the processes published."""
         self._answers.extend(sample for _, sample in last_messages(self._bus, SHOWN, self._query_timeout_s))

@@ -77,10 +77,10 @@ class _Drawing:
         self._due_ns = self._first_ns = self._last_ns = 0
         self._damaged, self._no_end = 0, ""
         self._stroke_nm: float | None = None
-        self._lost: dict[str, int] = {}  # by recording: the last file has the count of all files
+        self._lost: dict[str, int] = {}  # by recording: its last file has the count of all its files
 
     def begin(self, reader: LogReader) -> None:
-        """Begin the next log, after its first message was read, and with it the metadata at its start."""
+        """Begin the next log; the metadata at its start have been read with its first message."""
         self._order.begin(reader, self._last_ns)
         if self._renderer is None:
             config = self._config or _configuration_of(reader, self._drawn.remarks)
@@ -115,22 +115,20 @@ class _Drawing:
         self._due_ns = self._last_ns + _PERIOD_NS
 
     def end(self, reader: LogReader) -> None:
-        """End a log: note its damage, a missing end and its count of lost messages."""
+        """End a log: keep its damage, a missing end and its count of lost messages."""
         log = reader.path
         self._damaged += len(reader.damage)
         self._drawn.remarks += [f"{log.name}: left out {damage_in_words(damage)}" for damage in reader.damage]
         if missing := missing_end_text([log], finished=reader.finished):
             self._no_end = missing
             self._drawn.remarks.append(f"{log.name}: {missing}")
-        if re.fullmatch("[0-9]{1,18}", account := reader.metadata.get("recording", {}).get("messages_lost", "")):
-            self._lost[reader.metadata.get(PART, {}).get("of", log.name)] = int(account)
+        if re.fullmatch("[0-9]{1,18}", lost := reader.metadata.get("recording", {}).get("messages_lost", "")):
+            self._lost[reader.metadata.get(PART, {}).get("of", log.name)] = int(lost)
 
     def finish(self, logs: Sequence[Path]) -> DrawnLogs:
         """Draw the verdict on the logs, and return the summary."""
         if self._renderer is None:
-            raise DataFileError(
-                f"nothing to show in {', '.join(map(str, logs))}: they have no message that a view shows"
-            )
+            raise DataFileError(f"nothing to show in {', '.join(map(str, logs))}: no message that a view shows")
         ended = LogEnd(
             name=logs[-1].name.partition(".")[0],
             run=self._order.run,

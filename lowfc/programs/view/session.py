@@ -24,7 +24,7 @@ from lowfc.programs.view.recorded import DrawnLogs, draw_logs
 from lowfc.programs.view.target import Target
 
 PICTURE_AFTER_S = 8.0
-"""Time before a picture of a running loop is taken, so that its plots have data."""
+"""Time after which the picture of a running loop is taken, so that its plots have data."""
 _POLL_S = 0.1
 
 
@@ -72,7 +72,7 @@ def show_run(run_id: str, config: Configuration | None, target: Target, seconds:
 
 
 def show_logs(logs: list[Path], config: Configuration | None, target: Target) -> dict[str, Any]:
-    """Show consecutive logs; a window or page stays until it is closed or Ctrl-C.
+    """Show consecutive logs; a window or page stays until it is closed or Ctrl-C is pressed.
 
     Raises:
         ViewerError: no viewer starts, or it ended during drawing.

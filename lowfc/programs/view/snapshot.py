@@ -47,19 +47,19 @@ SHOWN = (FRAME, STEP, TRUTH, TIMING, MIRROR_STATE, SURFACE, CALIBRATION, CAMERA_
 
 PICTURES_HZ = 30.0
 PICTURES_PER_COMPLETE = 8
-"""One snapshot in eight is complete: curves grow four times a second, because many rows cost hardly more than one."""
+"""One snapshot in eight is complete: curves grow about four times a second; many points cost little more than one."""
 
 _MAX_KNOWN_EVENTS = 5000
 _UNREADABLE = (BadMessageError, DecodeError, KeyError, OverflowError, ValueError)
 
 
 class Wavefronts(NamedTuple):
-    """Residual wavefront of some frames, and `open`, the wavefront with a flat mirror: both true or both measured.
+    """Residual wavefronts of frames, and `open` ones, with a flat mirror: all true or all measured.
 
-    `residual_nm` and `open_nm` (frames, modes): modes; true ones are those at the start of each exposure.
+    `residual_nm` and `open_nm` (frames, modes): modes; the true ones are those at the start of each exposure.
     `residual_rms_nm` and `open_rms_nm` (frames, modes): rms of each mode over the frame period if it is known,
-    otherwise the modes themselves, with or without their signs. `rms_nm` (frames, 2): rms of residual and open; over
-    the open pupil if true, of all modes if measured.
+    otherwise the modes themselves, with or without their signs. `rms_nm` (frames, 2): rms of the residual and of the
+    open wavefront: over the open pupil if true, of all modes if measured.
     """
 
     sequence: Sequences
@@ -117,11 +117,11 @@ class Snapshot:
         frame, mirror, surface: newest frame (DN, at `frame_ns`), mirror state, and surface over the pupil (nm); None if
             none has arrived since the last snapshot or, in a `complete` one, since the last complete one. If there is a
             controller, `frame_ns` is at most `time_ns`, because the camera's clock may be ahead.
-        calibration, camera, controller: the latest of each; None before the first. health: the latest by process.
+        calibration, camera, controller: the latest state of each; None before the first. health: the latest by process.
         complete: whether all new data are included. An incomplete snapshot has only the newest frame, mirror state and
             surface; rows and events wait for a complete one.
-        behind_s: longest time for which its messages may have waited.
-        ended: end of the logs, in their last snapshot.
+        behind_s: longest time for which the messages of this snapshot may have waited.
+        ended: end of the logs, in their last snapshot; None in all others.
     """
 
     time_ns: int
@@ -224,7 +224,7 @@ class Accumulator:
     def snapshot(
         self, host_ns: int, *, complete: bool = True, behind_s: float = 0.0, ended: LogEnd | None = None
     ) -> Snapshot:
-        """Return the data since the last snapshot; `host_ns` is the present host time. See `Snapshot`."""
+        """Return the data since the last snapshot; `host_ns` is the present host time. Arguments: see `Snapshot`."""
         frame: Frame | None = self._newest_of(FRAME, _frame, complete=complete)
         frame_ns = frame.time_ns if frame is not None else 0
         if STEP in self._sent_ns:
@@ -276,7 +276,7 @@ class Accumulator:
         return self._data_ns + max(0, host_ns - self._data_host_ns) if self._data_ns else host_ns
 
     def _read(self, topic: Topic, message: Sample) -> None:
-        """Read a message of a topic whose messages are all kept; another number of modes discards the rows so far."""
+        """Read a message of a topic whose messages are all kept; rows of another number of modes are discarded."""
         if topic is STEP:
             step = wire.ControlStep.FromString(message.payload)
             time_ns = checked_time_ns(step.timestamp)

@@ -11,7 +11,7 @@ from lowfc.programs.view.draw.colours import Rgb, diverging
 from lowfc.programs.view.draw.plots import at, labels
 
 _STEPS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0)  # round numbers in a decade
-_SHRINK_NS = 2_000_000_000
+_SHRINK_NS = 2_000_000_000  # time of smaller values after which the limit shrinks
 
 
 class Scale:
@@ -20,7 +20,7 @@ class Scale:
     def __init__(self, min_limit: float) -> None:
         self._min_limit = min_limit
         self.limit = 0.0
-        self._needed_ns = 0
+        self._needed_ns = 0  # last time at which the limit was needed
 
     def fit(self, values: npt.NDArray[np.floating], time_ns: int) -> bool:
         """Adapt the limit to the finite values; True if the limit changed."""
@@ -36,7 +36,7 @@ class Scale:
 
 
 class Picture:
-    """Pictures at one path; the format is sent only when it changes, which saves two thirds of the time."""
+    """Pictures at one path of a stream; the format is sent only when it changes, which saves two thirds of the time."""
 
     def __init__(self, path: str) -> None:
         self.path = path
@@ -59,7 +59,7 @@ class Picture:
 
 
 class SignedPicture(Picture):
-    """Pictures of signed values: blue below zero, orange above, the range in the caption."""
+    """Pictures of signed values: blue below zero, orange above; the caption gives the range."""
 
     def __init__(self, path: str, unit: str) -> None:
         super().__init__(path)

@@ -42,7 +42,7 @@ class Loop(Panel):
         self._mode = 0
 
     def begin(self, stream: rr.RecordingStream) -> None:
-        """Send names and colours."""
+        """Send the names and colours of modes and curves."""
         style = rr.StateConfiguration(
             values=[mode.name for mode in MODE_COLOURS],
             labels=list(MODE_NAMES.values()),
@@ -57,7 +57,7 @@ class Loop(Panel):
         steps, used = snapshot.steps.at(new), snapshot.used[new]
         if not self._mode and state is not None and state.mode in _NAMES and state.HasField("mode_timestamp"):
             since_ns = from_timestamp(state.mode_timestamp)
-            if not steps.time_ns.size or since_ns < steps.time_ns[0]:  # in force before the first step shown
+            if not steps.time_ns.size or since_ns < steps.time_ns[0]:  # the mode began before the first step
                 self._change(stream, state.mode, since_ns)
         for row in np.flatnonzero(np.diff(steps.mode.astype(int), prepend=self._mode)):
             self._change(stream, int(steps.mode[row]), int(steps.time_ns[row]))

@@ -14,7 +14,7 @@ from lowfc.programs.view.snapshot import Snapshot
 ACTUATORS, SURFACE = "mirror/command", "mirror/surface"
 STROKE = Plot("mirror/stroke", "Mirror: stroke used, %", {"largest stroke used, % of the limit": YELLOW}, legend=None)
 _NEAR = 0.995
-"""Fraction of the stroke from which an actuator counts as limited: the controller keeps a margin, the driver rounds."""
+"""Fraction of the stroke limit from which an actuator is marked: the controller keeps a margin, the driver rounds."""
 
 
 class Mirror(Panel):

@@ -12,9 +12,9 @@ class Panel(ABC):
     """Draws its part of every snapshot, and keeps what it needs from earlier ones.
 
     Attributes:
-        pictures: whether it shows the newest data, so that it is drawn for incomplete snapshots too.
+        pictures: whether the panel shows pictures, which are drawn for incomplete snapshots too.
         plots: plots whose curves are the same in every run.
-        period_ns: time between two drawings of a panel that checks whether it is `due`.
+        period_ns: time between two drawings by a panel that draws only when it is `due`.
     """
 
     pictures = False

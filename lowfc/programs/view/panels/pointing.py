@@ -1,4 +1,4 @@
-"""Pointing panel: residual tip against tilt of the last two seconds, in mas, with rings."""
+"""Pointing panel: residual tip and tilt of the last two seconds as points in a plane, in mas, with rings."""
 
 from collections import deque
 from math import ceil
@@ -21,8 +21,8 @@ BOUNDS = rrb.VisualBounds2D(x_range=[-1.15, 1.15], y_range=[-1.15, 1.15])
 _MAX_POINTS = 400
 """Largest number of points of the trail; for a fast loop, not every frame has a point."""
 _TRAIL_NS = 2_000_000_000
-_RINGS = (0.25, 0.5, 1.0)
-_MIN_MAS = 0.5
+_RINGS = (0.25, 0.5, 1.0)  # radii as fractions of the scale
+_MIN_MAS = 0.5  # smallest scale
 
 Points = npt.NDArray[np.floating]
 

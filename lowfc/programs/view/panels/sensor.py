@@ -1,4 +1,4 @@
-"""Sensor panel: the frame, its difference from the reference, and the reference."""
+"""Sensor panel: the frame, its difference from the reference image, the reference image, and the raw frame."""
 
 import numpy as np
 import rerun as rr
@@ -15,7 +15,7 @@ FRAME, DIFFERENCE, REFERENCE, RAW = "sensor/frame", "sensor/difference", "sensor
 
 
 class Sensor(Panel):
-    """Pictures of the newest frame and its difference from the reference, and of the reference of a new calibration."""
+    """Pictures of the newest frame, its difference from the reference image, and the calibration's reference image."""
 
     pictures = True
     period_ns = 500_000_000  # between two raw frames

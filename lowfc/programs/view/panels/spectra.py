@@ -21,7 +21,7 @@ from lowfc.programs.view.verdicts.steady import LawInForce, SteadyFrames
 TILTS, OTHERS = "spectra/tip_tilt", "spectra/other_modes"
 WIDTH = 150.0
 
-_SEGMENT = 1024
+_SEGMENT = 1024  # frames; the axis begins at the lowest frequency of such a segment
 _MAX_DECADES = 2
 """Decades by which a scale may exceed the range of the data before it shrinks."""
 _MAX_LABELS = 6
@@ -33,9 +33,9 @@ _WIDTHS = (1.2, 1.8, 0.6)
 
 
 class Spectra(Panel):
-    """Spectra of the last frames under one loop mode and one law, drawn every two seconds.
+    """Spectra of the last frames since loop mode or law changed, drawn every two seconds.
 
-    At the end of a log with too few of these frames, the last spectra before them are drawn.
+    If there are too few of these frames at the end of a log, the last spectra from before the change are drawn.
     """
 
     def __init__(self) -> None:
@@ -72,7 +72,7 @@ class Spectra(Panel):
             elif ended and modes.any() and axes.path in self._last:  # no more frames will come
                 text, frequency_hz, powers = self._last[axes.path]
                 text += " before a change"
-            if powers and rate_hz:  # otherwise the axes stay, because the curves are the last ones
+            if powers and rate_hz:  # otherwise there is no curve, or the curves of the last drawing stay
                 self._fit(stream, axes, rate_hz, np.concatenate(powers))
             axes.draw(stream, np.log10(frequency_hz), [np.log10(power) for power in powers], _COLOURS, _WIDTHS)
             stream.log(f"{axes.path}/state", labels([_STATE_POSITION], [text]))

@@ -31,19 +31,19 @@ more cannot be read, and each stays in the viewer's memory."""
 _GAP, _INSET, _BAND, _CLOCK = 6, 9, 46, 190  # gap of boxes, inset of text, height of headline, width of clock, px
 _TILES_END = 196  # lower edge of the tiles, px
 _FACTS = (3, 4, 4, 4)  # relative widths of the facts below the tiles
-_MIN_FONT = 8
-_SHADES = 16  # of each level
+_MIN_FONT = 8  # px
+_SHADES = 16  # number of shades of each level
 _PITCH = 1.16  # distance from line to line, in font sizes
 
 Box = tuple[int, int, int, int]
 """Left, top, right and bottom, px; left and top are inside the box, right and bottom just outside."""
 Text = tuple[Box, str, int]
-"""Box, words, and largest font size."""
+"""Box, text, and largest font size in px."""
 Shades = npt.NDArray[np.uint8]
 
 
 class Tiles(Panel):
-    """Draws the verdict on the run, once a second and when its words change; at a log's end, on the whole log."""
+    """Draws the verdict on the run once a second, and when its words change; at a log's end, the verdict on the log."""
 
     def __init__(self, nm_per_mas: float) -> None:
         """`nm_per_mas`: wavefront rms of a tilt of 1 mas."""
@@ -158,13 +158,13 @@ def _wrapped(text: str, size: int, width: int) -> list[str]:
 
 
 def _width(text: str, size: int) -> float:
-    """Width of a line of text, slightly overestimated."""
+    """Width of a line of text, px, slightly overestimated."""
     return sum(map(_advance, text)) * size * 1.02
 
 
 @lru_cache(maxsize=1024)
 def _advance(letter: str) -> float:
-    """Width of a letter per font size; cached, because measuring is slower than drawing."""
+    """Width of a letter divided by the font size; cached, because measuring is slower than drawing."""
     return float(_font(64).getlength(letter)) / 64
 
 

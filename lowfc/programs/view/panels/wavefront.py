@@ -1,4 +1,4 @@
-"""Panel of the wavefront against time: every mode, tip and tilt in mas, residual in total and by group of modes."""
+"""Panel of the wavefront against time: each mode, tip and tilt in mas, total residual, residual by group of modes."""
 
 import numpy as np
 import numpy.typing as npt

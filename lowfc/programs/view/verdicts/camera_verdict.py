@@ -9,16 +9,16 @@ from lowfc.programs.view.verdicts.run_state import RECENT_S, Liveness, RunState
 from lowfc.programs.view.verdicts.tile import Level, Tile, absent, duration, worst_of
 
 SLOW = 0.9
-"""Fraction of the camera's nominal rate below which camera or host does not keep up."""
+"""Measured rate as a fraction of the camera's nominal rate, below which camera or host does not keep up."""
 FEW = 0.005
-"""Fraction of frames lost or refused below which no harm is measurable: reported without a warning."""
+"""Fraction of frames lost or refused below which no harm is measurable: they are reported without a warning."""
 MANY_LOST = 0.1
 """Fraction of frames lost above which the loop no longer behaves as tuned."""
 DARK, DIM, BRIGHT = 0.2, 0.5, 2.0
 """Fractions of the expected light. Below a fifth of it, the controller refuses frames by default; at half of it, the
-noise is 1.4 times larger; with more than twice, the star is not the calibrated one."""
+photon noise is 1.4 times larger; with more than twice as much, the star is not the calibrated one."""
 HEALTH_OVERDUE_S = 4.0
-"""Time without a frame after which a camera that is not silent certainly runs: a dead one would be silent by then."""
+"""Time without a frame after which a camera that still sends Health certainly runs: a dead one would be silent."""
 
 REFUSED: dict[Reason, tuple[str, str]] = {
     Rejection.DARK: ("too dark", "the star is gone; check pointing, shutter and clouds"),
@@ -42,7 +42,7 @@ _IF_ALL: dict[Reason, str] = {
     Rejection.OUT_OF_ORDER: "a clock was set back, or there is a second camera; stop that camera, or `lowfc ctl safe` "
     "and then `lowfc ctl clear`, which flatten the mirror"
 }
-"""Advice if every frame is refused, where it differs from that in `REFUSED`."""
+"""Advice if every frame is refused, where it differs from the advice in `REFUSED`."""
 _FRAME_REASONS = [reason for reason in REFUSED if reason not in (Rejection.NO_MIRROR, Rejection.HELD)]
 """Reasons that the tile FRAMES reports; the tile LOOP reports the others."""
 
@@ -111,7 +111,7 @@ def _refused(state: RunState, expected: float) -> Tile:
 
 
 def star(state: RunState) -> Tile:
-    """Tile STAR: light, as a fraction of what the calibration expects."""
+    """Tile STAR: light on the sensor, as a fraction of the light that the calibration expects."""
     tile, flux, stopped = partial(Tile, "STAR"), state.flux, state.camera.life is Liveness.STOPPED
     if flux is None or (state.frame_silent_s is not None and not stopped):
         return tile("?", "light unknown")

@@ -16,7 +16,7 @@ _MAX_NAMED = 3
 
 
 def facts(state: RunState) -> dict[str, str]:
-    """The facts of a run by title, as far as they are known."""
+    """The facts of a run by title; a text says which are not known."""
     snapshot, note = state.snapshot, "none known"
     if state.note is not None:
         at = clock(from_timestamp(state.note.timestamp), "%H:%M")

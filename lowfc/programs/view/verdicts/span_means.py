@@ -15,7 +15,7 @@ _COLUMNS = 8
 
 
 class SpanMeans:
-    """Means over consecutive spans of `span_ns`, at first one second; they begin at `begin_ns`, None without rows.
+    """Means over consecutive spans of `span_ns`, at first one second. The first begins at `begin_ns`, None if empty.
 
     The wavefront is the `true` one of a simulation, otherwise the measured one.
     """
@@ -24,7 +24,7 @@ class SpanMeans:
         self.begin_ns: int | None = None
         self.span_ns = _FIRST_NS
         self.true = False
-        self._last_ns = 0  # newest time, after `begin_ns`
+        self._last_ns = 0  # newest time, ns after `begin_ns`
         self._sums = np.zeros((0, _COLUMNS))
 
     def feed(self, snapshot: Snapshot) -> None:
@@ -37,12 +37,12 @@ class SpanMeans:
             self.add(steps.time_ns[used], _LIGHT, steps.flux_dn[used, None] / snapshot.calibration.flux_dn)
 
     def add_wavefronts(self, time_ns: Long, rms_nm: Single, *, true: bool) -> None:
-        """Add true or measured wavefronts, rms (frames, 2): residual, with a flat mirror."""
+        """Add true or measured wavefronts: rms (frames, 2) of the residual and with a flat mirror."""
         self.true |= true and time_ns.size > 0
         self.add(time_ns, _TRUE if true else _MEASURED, rms_nm.astype(float) ** 2)
 
     def wavefront(self) -> tuple[Array, Array]:
-        """Middle of each span (spans,), ns after `begin_ns`, and rms nm (spans, 2): residual, with a flat mirror.
+        """Middle of each span (spans,), ns after `begin_ns`; rms (spans, 2) of the residual and with a flat mirror, nm.
 
         A span without a frame that was used is NaN.
         """
@@ -50,7 +50,7 @@ class SpanMeans:
         return np.asarray((np.arange(len(sums)) + 0.5) * self.span_ns, np.float64), np.asarray(np.sqrt(_means(sums)))
 
     def rms_nm(self) -> tuple[float, float]:
-        """Rms of all wavefronts: residual, with a flat mirror; NaN if there is none."""
+        """Rms of all wavefronts, nm: of the residual, and with a flat mirror; NaN if there are none."""
         residual_nm, flat_nm = np.sqrt(_means(self._wavefront.sum(axis=0, keepdims=True)))[0].tolist()
         return residual_nm, flat_nm
 
@@ -59,7 +59,7 @@ class SpanMeans:
         return _means(self._sums[:, _LIGHT])[:, 0]
 
     def add(self, time_ns: Long, columns: slice, values: npt.NDArray[np.floating]) -> None:
-        """Add rows (rows, values) at their times to the sums in these columns, and count them in the first one."""
+        """Add `values` (rows, values) at their times to the sums in these columns; the first column counts the rows."""
         if self.begin_ns is None and time_ns.size:
             self.begin_ns = int(time_ns.min())
         after_ns = time_ns - (self.begin_ns or 0)

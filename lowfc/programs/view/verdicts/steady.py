@@ -20,7 +20,7 @@ FRAMES = 6144
 
 
 class LawInForce(NamedTuple):
-    """The integrator; `linear`: identity and overruled modes of the law that replaces it, empty without a law."""
+    """The integrator, and `linear`: identity and overruled modes of the law that replaces it; empty without a law."""
 
     gain: tuple[float, ...]
     leak: tuple[float, ...]
@@ -31,7 +31,7 @@ class LawInForce(NamedTuple):
 class SteadyFrames:
     """Measured error and pseudo-open-loop of the last frames since loop mode or law changed, after settling.
 
-    `mode` is 0 before the first step; `law` is None if the controller reports none, or a law for other modes.
+    `mode` is 0 before the first step; `law` is None if the controller has reported no valid gains for these modes.
     """
 
     def __init__(self) -> None:
@@ -64,7 +64,7 @@ class SteadyFrames:
         return True
 
     def rows(self) -> tuple[Sequences, Single]:
-        """Sequence of each frame, and error and pseudo-open-loop (frames, 2 x modes); only after the first `feed`."""
+        """Sequence of each frame; error and pseudo-open-loop (frames, 2 x modes), nm. Only after a `feed` that was true."""
         sequence, signals = (np.concatenate(column) for column in zip(*self._kept, strict=True))
         return sequence, signals
 
@@ -83,7 +83,7 @@ class ResidualComparison(NamedTuple):
 def compare_with_best_gains(
     steady: SteadyFrames, rate_hz: float, camera: wire.CameraState | None
 ) -> ResidualComparison | None:
-    """Evaluate the last frames; None if the loop is not closed, its law is unknown, or too few frames are in a row."""
+    """Residuals of the last frames; None if the loop is not closed, its law is unknown, or too few are in a row."""
     law, modes = steady.law, len(steady.law.gain) if steady.law is not None else 0
     if law is None or steady.mode != LoopMode.CLOSED or not rate_hz:
         return None

@@ -26,10 +26,10 @@ improvement of a loop that has just closed or recovered."""
 SILENT_S = 2.0
 """Time without a message after which a process counts as silent: four Healths, which are sent twice a second."""
 FRAMES_SILENT_S = 1.0
-"""Time without a frame or a step after which it is reported as missing, but at least `PERIODS` frame periods."""
+"""Time without frames or steps after which they are reported as missing, but at least `PERIODS` frame periods."""
 COMPARISON_PERIOD_NS = 30_000_000_000
 """Time between two computations of the best gains, which take 0.3 s for 14 modes."""
-_SAMPLES = 1000  # largest number kept
+_SAMPLES = 1000  # largest number of samples kept
 _MODES: dict[int, LoopMode] = {mode.value: mode for mode in LoopMode}
 _COUNTERS: dict[str, tuple[Role, Callable[[wire.Health], int]]] = {
     "skipped": (Role.CONTROLLER, lambda health: topic_count(health, FRAME.key).skipped),
@@ -93,7 +93,7 @@ class Watcher:
             self._last_active = self._last_samples(NOW_S)
 
     def state(self) -> RunState:
-        """The state at the last snapshot."""
+        """State of the run at the last snapshot."""
         snapshot, now = self._snapshot, self._last_samples(NOW_S)
         controller = self._process((Role.CONTROLLER,), STEP, CONTROLLER_STATE)
         stopped = controller.life is Liveness.STOPPED
@@ -134,7 +134,7 @@ class Watcher:
         return [one for one in self._samples if one.host_ns > begin_ns]
 
     def _worst_mirror(self) -> Process:
-        """The mirror that is silent longest; a stopped one only if all are stopped."""
+        """The mirror whose last message is oldest, silent ones first; a stopped mirror only if all are stopped."""
         names = [name for name in self._snapshot.health if name.startswith(mirror_role(""))]
         if len(names) <= 1:
             return self._process(names, MIRROR_STATE)
@@ -144,7 +144,7 @@ class Watcher:
         )
 
     def _process(self, names: Iterable[str], *topics: Topic) -> Process:
-        """Liveness of a process by its Health or its other topics."""
+        """Liveness of the first of these processes that sent Health, by its Health or by these topics."""
         last = next((self._snapshot.health[name] for name in names if name in self._snapshot.health), None)
         sent_ns = max((self._snapshot.sent_ns.get(topic, 0) for topic in topics), default=0)
         last_ns = max(sent_ns, last.time_ns if last is not None else 0)
@@ -166,7 +166,7 @@ class Watcher:
         return silent_s if silent_s > max(FRAMES_SILENT_S, PERIODS * self._snapshot.period_ns * 1e-9) else None
 
     def _since_s(self, time_ns: int) -> float:
-        """Time since `time_ns`, minus the delay of this view."""
+        """Time since `time_ns`, minus the time for which messages may have waited in this view."""
         return max(0.0, (self._snapshot.host_ns - time_ns) * 1e-9 - self._snapshot.behind_s)
 
     def _update_mode(self, snapshot: Snapshot) -> None:

@@ -12,13 +12,14 @@ from lowfc.programs.view.verdicts.steady import ResidualComparison
 from lowfc.programs.view.verdicts.tile import Level, Tile, rounded, short
 
 DIVERGING = 3.0
-"""Ratio of residual to open wavefront above which the loop is unstable or has wrong signs, not only bad gains."""
+"""Ratio of the residual to the wavefront with a flat mirror, above which more than the gains is wrong: the loop is
+unstable or has wrong signs."""
 NEAR_BEST = 1.3
-"""Ratio of the residual to that of the best gains above which the gains are worth tuning."""
+"""Ratio of the residual to the residual with the best gains, above which the gains are worth tuning."""
 NOISE_FLOOR = 0.2
 """Uncertainty of a residual whose noise was subtracted, as a fraction of the sensor's noise."""
 UNCORRECTED = ("OPEN", "SAFE", "IDLE", "WAITING", "DEAD", "NO CONTROLLER")
-"""Values of the tile LOOP for which nothing is corrected."""
+"""Values of the tile LOOP that mean that the wavefront is not corrected."""
 
 
 def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
@@ -69,7 +70,7 @@ def contrast(figures: wire.WavefrontFigures, *, now: bool, estimated: bool) -> T
 
 
 def reduction_of(residual_nm: float, open_nm: float, noise_nm: float) -> float:
-    """Reduction of the wavefront by the loop, without the sensor's noise."""
+    """Rms with a flat mirror divided by the rms of the residual, both without the sensor's noise."""
     least_nm = max(NOISE_FLOOR * noise_nm, 1e-9)
     residual_nm, open_nm = (max(sqrt(max(one**2 - noise_nm**2, 0.0)), least_nm) for one in (residual_nm, open_nm))
     return open_nm / residual_nm
