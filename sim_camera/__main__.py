@@ -19,7 +19,7 @@ def camera(
     frames: Frames = None,
     wait_for: WaitFor = None,
 ) -> None:
-    """Publish simulated frames of a run, with the mirror's shape from the bus and a disturbance drawn from the seed.
+    """Publish simulated frames in a run, with the mirror's shape from the bus and a disturbance drawn from the seed.
 
     Example: sim-camera --run bench --wait-for controller --wait-for mirror-dm
     """

@@ -6,7 +6,7 @@ from lowfc.arrays import Single
 from lowfc.optics.chain.added_contrast import ModalContrast
 
 IMAGES = 200
-"""Number of full images averaged for each mean; smaller in a short run."""
+"""Number of full images averaged for each mean; fewer in a short run."""
 
 
 class Contrast:
@@ -19,7 +19,7 @@ class Contrast:
         self._stride, self._frames = 1, 0
 
     def add(self, disturbance_nm: Single, residual_nm: Single) -> None:
-        """Add the modes (modes,) at one instant of the next frame."""
+        """Add the modes (modes,) at one instant of the next frame, nm of wavefront rms."""
         if self._frames % self._stride == 0:
             self._instants.append((disturbance_nm, residual_nm))
             if len(self._instants) == 4 * IMAGES:
@@ -27,7 +27,7 @@ class Contrast:
         self._frames += 1
 
     def quadratic(self, modes_nm: Single) -> Single:
-        """Mean contrast added by each mode (..., modes) of wavefronts (..., many, modes), from the quadratic form."""
+        """Mean contrast added by each mode (..., modes) of wavefronts (..., n, modes), nm, by the quadratic form."""
         added = np.einsum("...nj,...nj->...j", modes_nm @ self._form, modes_nm)
         return np.asarray(added / np.float32(modes_nm.shape[-2]), np.float32)
 
@@ -38,7 +38,7 @@ class Contrast:
         `quadratic_added_contrast` is from the quadratic form. Empty before the first frame.
         """
         half = self._instants[len(self._instants) // 2 :]
-        instants = [half[int(place)] for place in np.linspace(0, len(half) - 1, min(IMAGES, len(half)))]
+        instants = [half[int(position)] for position in np.linspace(0, len(half) - 1, min(IMAGES, len(half)))]
         if not instants:
             return {}
         by_image = self._modal.by_image

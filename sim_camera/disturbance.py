@@ -1,9 +1,9 @@
 """The wavefront's disturbance: a pure function of the seed, the frame rate and the frame's number.
 
-Every preset is a sum of sine waves with seeded phases (a spectral model of drift and jitter), damped lines, a square
-wave and a static screen. The spectrum of waves, lines and wheels of constant speed is known exactly. A damped line is a
-rotating vector whose length and phase wander (an Ornstein-Uhlenbeck process). It is drawn frame by frame: a frame
-requires all frames before it.
+Every preset is a sum of some of these: sine waves with seeded phases (a spectral model of drift and jitter), damped
+lines, a square wave, a static screen. The spectrum of waves, lines and wheels of constant speed is known exactly. A
+damped line is a rotating vector whose length and phase wander (an Ornstein-Uhlenbeck process). It is drawn frame by
+frame: a frame requires all frames before it.
 """
 
 from dataclasses import dataclass, replace
@@ -20,8 +20,8 @@ BLOCK = 8
 LINE_WIDTH = 0.005
 """Width of a damped line between its half-power points, as a fraction of its frequency."""
 
-# The reaction wheel: rms of each line per axis, mas. It falls with frequency as a telescope's structure damps it;
-# with the drift the total is 14 mas.
+# Lines of the reaction wheel and their rms per axis, mas. The rms falls with frequency, as a telescope's structure
+# damps fast vibrations; with the drift the total is 14 mas.
 LINES_HZ = (6.0, 18.0, 37.0, 71.0, 117.0)
 LINES_MAS = (9.0, 8.3, 5.0, 3.0, 2.0)
 _DRIFT_MAS = 3.0
@@ -34,7 +34,7 @@ _THERMAL_NM = {1: 4.0, 2: 5.0, 3: 2.5, 4: 1.5}  # rms, by radial degree
 _THERMAL_HZ = (0.003, 0.5)
 _DRIFT_HZ = (0.02, 5.0)
 _WAVES_PER_BAND = 24
-_FRAMES_AT_ONCE = 1 << 14
+_FRAMES_AT_ONCE = 1 << 14  # largest number of frames for which damped lines are drawn at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +58,10 @@ class Disturbance:
         static_nm: (modes,) constant wavefront.
         screen_nm: rms of a static Kolmogorov screen, 0 for none.
         lines: damped lines.
-        seed: seed of the damped lines and of the sources that `with_sources` adds.
+        seed: seed of the damped lines, and of the drift, jitter and shear that `with_sources` adds.
         wheels: reaction wheels, whose speeds may change.
-        shear: shear of the beam on the sensor's masks as sine waves: Hz (waves,) and pupil diameters (waves, 2).
+        shear: shear of the beam on the sensor's masks as sine waves: frequencies (waves,), Hz, and complex amplitudes
+            (waves, 2) along x and y, pupil diameters.
     """
 
     noll: tuple[int, ...]
@@ -90,11 +91,11 @@ def preset_disturbance(
     Args:
         preset: name of the preset.
         noll: Noll index of each mode.
-        seed: seed of all phases.
+        seed: seed of all phases and of the damped lines.
         nm_per_mas: wavefront rms of a milliarcsecond of tilt.
         wavelength_nm: central wavelength.
         scale: factor on the amplitudes of the preset.
-        static_nm: constant wavefront, nm rms by Noll index.
+        static_nm: constant wavefront, nm rms, by Noll index.
         line_width: width of the reaction wheel's lines between half-power points, as a fraction of their frequency; 0
             for undamped lines.
 
@@ -150,14 +151,14 @@ def with_sources(
     jitter_nm: float,
     shear: float,
 ) -> Disturbance:
-    """The disturbance with drift, jitter and shear added, each with its own random stream.
+    """The disturbance with drift, jitter and shear added, each drawn from its own random stream.
 
     Args:
-        disturbance: the disturbance without them.
+        disturbance: the disturbance without drift, jitter and shear.
         rate_hz: frame rate.
-        drift_nm: random walk of modes, nm per root second by Noll index.
-        drift_slope: the drift's power per hertz falls as 1 / f^drift_slope; 2 for a random walk.
-        jitter_nm: rms of tip and of tilt, white from 0.5 to 1.5 times the frame rate.
+        drift_nm: strength of the drift, nm per root second by Noll index.
+        drift_slope: the drift's power per hertz falls as 1 / f^drift_slope; with 2 it is a random walk.
+        jitter_nm: rms of the jitter of tip and of tilt, white from 0.5 to 1.5 times the frame rate.
         shear: rms of the beam's slow wander on the sensor's masks along each axis, pupil diameters.
     """
     waves = [(disturbance.frequency_hz, disturbance.amplitude_nm)]
@@ -190,14 +191,14 @@ def speeds_hz(disturbance: Disturbance, time_s: float) -> Array:
 
 
 def highest_hz(disturbance: Disturbance) -> float:
-    """Highest frequency of the waves, the damped lines and, at time 0, the wheels' harmonics, Hz."""
+    """Highest frequency of the waves, of the damped lines and of the wheels' harmonics at time 0, Hz."""
     lines = [line.frequency_hz for line in disturbance.lines]
     harmonics = [max(ORDERS) * abs(wheel.start_hz) for wheel in disturbance.wheels]
     return float(max([0.0, *disturbance.frequency_hz, *lines, *harmonics]))
 
 
 def variances_nm2(disturbance: Disturbance, per_line: int = 401) -> tuple[Array, Array]:
-    """Frequencies (n,) in Hz of waves, damped lines and wheels, and the variance at each (n, modes), nm^2.
+    """Frequencies (n,), Hz, of waves, damped lines and wheels, and the variance of each mode at them (n, modes), nm^2.
 
     A damped line is represented by `per_line` quantiles of its power, a wheel by its harmonics at time 0.
     """
@@ -235,7 +236,7 @@ class _DampedLines:
         self._next, self._vector = 0, self._draw(1)[0]
 
     def _draw(self, count: int) -> Complex:
-        """Random vectors (count, lines, moved) with the variance of each line, real and imaginary parts alike."""
+        """Random vectors (count, lines, moved); real and imaginary parts each have the variance of the line."""
         parts = self._rng.standard_normal((count, *self._rms_nm.shape, 2))
         return np.asarray((parts[..., 0] + 1j * parts[..., 1]) * self._rms_nm)
 
@@ -260,7 +261,7 @@ class _DampedLines:
 
 
 class Sampler:
-    """The disturbance at fixed instants of every period, in single precision, computed in blocks of frames."""
+    """The disturbance at the same instants of each period, in single precision, computed in blocks of frames."""
 
     def __init__(self, disturbance: Disturbance, instants: Array, rate_hz: float) -> None:
         """Prepare the waves; `instants` (instants,) are in periods after the start of an exposure."""
@@ -276,7 +277,7 @@ class Sampler:
 
     def at(self, index: int) -> Single:
         """Modes (instants, modes) in the period of a frame, nm of wavefront rms."""
-        first = index - index % BLOCK  # so that a frame does not depend on the order of the calls
+        first = index - index % BLOCK  # fixed blocks, so that a frame does not depend on the order of the calls
         if first not in self._blocks:
             # Keep the two blocks before: a frame's truth is computed after the exposure of up to ten later frames.
             self._blocks = {before: block for before, block in self._blocks.items() if 0 < first - before <= 2 * BLOCK}
@@ -322,9 +323,9 @@ def _end_weights(lines: tuple[DampedLine, ...], time_s: Array, period_s: float) 
 
 
 def screen(seed: int, samples: int, spacing: float) -> Array:
-    """Kolmogorov screen (samples, samples) with spectrum f^-11/3, sampled at a spacing in pupil diameters.
+    """Kolmogorov screen (samples, samples) with power spectrum f^-11/3; `spacing` of the samples in pupil diameters.
 
-    It has a period of four pupil diameters and an arbitrary amplitude. It is cut off at 12 cycles per diameter, far
+    It has a period of four pupil diameters and an arbitrary amplitude. Its spectrum ends at 12 cycles per diameter, far
     beyond what the sensor's focal-plane mask passes, so that coarse nodes do not alias fine structure.
     """
     rng = np.random.default_rng([seed, 2])
@@ -340,12 +341,12 @@ def screen(seed: int, samples: int, spacing: float) -> Array:
 
 
 def _thermal_nm(noll: tuple[int, ...]) -> Array:
-    """Rms of the thermal drift of each mode, by radial degree."""
+    """Rms (modes,) of the thermal drift of each mode, nm; it depends on the radial degree."""
     return np.array([_THERMAL_NM.get(noll_to_orders(index)[0], 1.0) for index in noll])
 
 
 def _drift(rng: np.random.Generator, rms_nm: Array, band_hz: tuple[float, float]) -> tuple[Array, Complex]:
-    """Sine waves, even in log(frequency), with power per hertz falling as 1/f^2; rms `rms_nm` (modes,) of their sum."""
+    """Sine waves about even in log(frequency), with power per hertz falling as 1/f^2; their sum has `rms_nm` (modes,)."""
     frequencies = np.geomspace(*band_hz, _WAVES_PER_BAND) * rng.uniform(0.95, 1.05, _WAVES_PER_BAND)
     weights = frequencies**-0.5
     weights *= np.sqrt(2 / np.sum(weights**2))

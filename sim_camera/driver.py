@@ -38,14 +38,14 @@ from sim_camera.wavefront_statistics import WavefrontAccumulator
 from sim_camera.wheel import wheels
 
 PATIENCE_S = 5.0
-"""In lockstep, the run ends after this much real time without progress."""
+"""Real time without a state of the mirror after which a run in lockstep ends."""
 RECENT_S = 2.0
 """Averaging time of the wavefront statistics reported while the loop runs."""
 TRUTHS_S = 0.01
-"""Longest time for which the truths of frames are kept, to be computed together, unless the loop is in lockstep."""
+"""Longest time for which frames wait until their truths are computed together; in lockstep they do not wait."""
 MAX_WAIT_NS = 500_000_000
 """Longest wait in a call of `expose`: half a second, as for every driver (see `Camera.expose`)."""
-_REMEMBERED = 256  # largest number of waiting mirror states, and of stored publication times of frames
+_REMEMBERED = 256  # largest number of mirror states that wait, and of publication times of frames that are kept
 
 
 def disturbance_of(config: Configuration) -> Disturbance:
@@ -108,9 +108,9 @@ def scene(config: Configuration, disturbance: Disturbance | None = None) -> Scen
 
 
 def _centred_region(name: str, size: int, available: int) -> tuple[int, int]:
-    """First row (or column) of the centred readout region, and its number of rows (columns); all for size 0."""
+    """First row (or column) of the centred readout region, and its number of rows (columns); size 0 means all."""
     if size > available:
-        raise ConfigurationError(f"options of the simulated camera: {name} is {size}, the sensor has {available}")
+        raise ConfigurationError(f"options of the simulated camera: {name} is {size}, the sensor has only {available}")
     return ((available - size) // 2, size) if size else (0, available)
 
 
@@ -159,11 +159,12 @@ class SimulatedCamera:
         self._path = MirrorPath(flat, applied - 1, settling)
         self._index, self._origin_ns = 0, 0
         self._exposing = self._exposed = _Exposed(-1, 0, 0, 0, flat)
-        # Frames whose truth is not computed yet, and the mirror's motion in their periods.
+        # Frames whose truth is not yet computed, each with the mirror's motion in its period.
         self._waiting: list[tuple[_Exposed, MirrorMotion]] = []
         self._truths_at_once = 1 if config.lockstep else min(max(1, int(TRUTHS_S * config.camera.rate_hz)), MAX_TRUTHS)
-        self._newest_state = self._last_frame = 0  # sequences
-        self._published_ns = [(0, 0)] * _REMEMBERED  # (sequence, time) of the last frames
+        # Frame sequence of the newest command that the mirror applied, and sequence of the last frame sent.
+        self._newest_state = self._last_frame = 0
+        self._published_ns = [(0, 0)] * _REMEMBERED  # sequence and publication time of the last frames
         self._lateness = Lateness()
         self._frame_to_mirror = Durations()
         recent_frames = max(1, round(RECENT_S * config.camera.rate_hz))
@@ -174,14 +175,14 @@ class SimulatedCamera:
     def join(self, service: Service) -> None:
         """Declare the publisher of the truth and subscribe to the mirror."""
         self._service = service
-        # Made only here: by now the process is limited to one BLAS thread.
+        # Made here, not in `__init__`, because by now the process is limited to one BLAS thread.
         self._contrast = Contrast(factory.contrast_of(self._config))
         self._truths = service.publisher(TRUTH)
         service.bus.subscribe(MIRROR_STATE, self._on_mirror_state, self._config.mirror.name)
         service.on_stop(self._arrived.wake)
 
     def through(self, publisher: Publisher) -> Puts:
-        """The publisher, wrapped if the options name a fault."""
+        """The publisher of frames; if the options name a fault, one that injects it."""
         if self._fault is None:
             return publisher
         highest = saturation_dn(factory.detector(self._config))
@@ -238,7 +239,7 @@ class SimulatedCamera:
         """Wait until the mirror has applied the command computed from the last frame.
 
         Raises:
-            BusError: no state of the mirror for PATIENCE_S.
+            BusError: no state of the mirror for `PATIENCE_S`.
         """
         while self._newest_state < self._last_frame and self._service.running:
             if not self._states and self._arrived.take(PATIENCE_S) is None and self._service.running:
@@ -275,7 +276,7 @@ class SimulatedCamera:
             self._waiting.append((self._exposed, self._path.motion(index, self._scene.instants)))
 
     def _publish_truths(self) -> None:
-        """Publish the truth of the frames that wait for it."""
+        """Compute and publish the truths of the frames that wait."""
         if not self._waiting:
             return
         waiting, self._waiting = self._waiting, []
@@ -335,7 +336,7 @@ class SimulatedCamera:
                 continue
             self._latched = shape
             latest = self._exposed.frame + 1  # the next exposure starts with this shape, even after a stall of the host
-            self._path.applied(self._moment(sample.publish_time_ns), shape, latest)
+            self._path.applied(self._reached_at(sample.publish_time_ns), shape, latest)
             if state.frame_sequence > self._newest_state:
                 self._newest_state = state.frame_sequence
                 sequence, published_ns = self._published_ns[state.frame_sequence % _REMEMBERED]
@@ -343,11 +344,11 @@ class SimulatedCamera:
                     self._count_late(state.frame_sequence < self._last_frame)
                     self._frame_to_mirror.add(sample.publish_time_ns - published_ns)
 
-    def _moment(self, publish_time_ns: int) -> float:
-        """Time at which the mirror reached a shape, in periods.
+    def _reached_at(self, publish_time_ns: int) -> float:
+        """Time at which the mirror reached a shape, in periods after the start of the first exposure.
 
-        In lockstep, or with a fractional delay, for which the shape moves during an exposure, this is the start of the
-        next exposure.
+        It is the start of the next exposure in lockstep, before the first exposure, and with a fractional delay, which
+        itself moves the shape during an exposure.
         """
         index, start_ns = self._exposed.frame, self._exposed.start_ns
         if self._service.clock.lockstep or index < 0 or self._config.camera.delay_frames % 1:
@@ -355,13 +356,13 @@ class SimulatedCamera:
         return index + (publish_time_ns - start_ns) / self._config.period_ns
 
     def _count_late(self, late: bool) -> None:
-        """Count a command; report when commands become habitually late, and when they no longer are."""
+        """Count a command; report when commands become habitually late, and when this ends."""
         if self._lateness.add(late):
             event = "COMMANDS_LATE" if self._lateness.habitual else "COMMANDS_IN_TIME"
             self._service.event(event, percent=self._lateness.percent)
 
     def _no_progress(self) -> str:
-        """Text of the error of a run in lockstep without progress."""
+        """Text of the error of a lockstep run without progress: the frame, and the processes without recent Health."""
         now_ns = self._service.clock.host_ns()
         silent = [
             name

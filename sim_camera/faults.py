@@ -9,12 +9,12 @@ import numpy.typing as npt
 
 Frame = npt.NDArray[np.uint16]
 
-MAX_FRAMES_LATE = 50  # largest lateness of a frame, in frames
-LOST_SHARE = 0.1  # fraction of the frames that is lost
-HOT_SHARE = 0.1  # fraction of the pixels that is hot
-COSMIC_SHARE = 0.2  # fraction of the frames with a cosmic-ray track
+MAX_FRAMES_LATE = 50  # largest delay of a late frame, in frames
+LOST_SHARE = 0.1  # probability that a frame is lost
+HOT_SHARE = 0.1  # probability that a pixel is hot, drawn anew for each frame
+COSMIC_SHARE = 0.2  # probability of a cosmic-ray track in a frame
 TRACK_PIXELS = 6
-"""Length of a cosmic-ray track, pixels: below the limit of saturated pixels, so that the frame is used."""
+"""Length of a cosmic-ray track, pixels: at most `max_saturated_pixels` by default, so that the frame is used."""
 
 
 class Kind(StrEnum):
@@ -75,7 +75,7 @@ class Fault:
         Args:
             index: index of the frame.
             frame: the frame without a fault.
-            before: the detector's output for the frame before.
+            before: the detector's output, with its fault, for the frame before.
             dark: value without light, DN.
             highest: value of a pixel at full well, DN.
         """

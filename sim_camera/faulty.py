@@ -1,4 +1,4 @@
-"""A camera's publisher with a fault, to test the reaction of other processes."""
+"""A publisher of frames that injects a fault, to test the reaction of other processes."""
 
 import json
 from collections import deque
@@ -44,7 +44,7 @@ class FaultyFrames:
         self._index = self._start_s = 0
 
     def put(self, payload: bytes) -> Envelope:
-        """Publish the messages due at the end of an exposure; return the envelope of its frame, even if not sent."""
+        """Publish the messages due at the end of an exposure; return its frame's envelope, even if that is not sent."""
         index, now_ns = self._index, self._now_ns()
         self._index += 1
         message = self._message(index, RawImage.FromString(payload))
@@ -57,8 +57,8 @@ class FaultyFrames:
         messages = {number: (body, time_ns) for number, body, time_ns in self._messages}
         for number in self._fault.frames_due(index):
             if number in messages:
-                earlier = EARLIER_S if self._fault.kind_at(number) is Kind.OLD_SEQUENCE else 0
-                self._publisher.put(*messages[number], sequence_of(self._start_s - earlier, number))
+                shift_s = EARLIER_S if self._fault.kind_at(number) is Kind.OLD_SEQUENCE else 0
+                self._publisher.put(*messages[number], sequence_of(self._start_s - shift_s, number))
         return Envelope(sequence_of(self._start_s, index), now_ns)
 
     def _message(self, index: int, good: RawImage) -> bytes:

@@ -3,17 +3,17 @@
 from collections import deque
 
 WINDOW = 500
-"""Number of most recent commands in the statistics."""
-_ON = 0.25  # fraction of the window above which late commands become habitual
-_OFF = 0.125  # fraction at and below which they no longer are
+"""Number of newest commands in the statistics."""
+_ON = 0.25  # fraction of late commands in the window above which `habitual` becomes true
+_OFF = 0.125  # fraction at and below which it becomes false
 
 
 class Lateness:
     """Counts late commands.
 
     Attributes:
-        total: late commands since the start.
-        habitual: becomes true when more than a quarter of the window is late, false when an eighth or less is.
+        total: number of late commands since the start.
+        habitual: becomes true when late commands exceed a quarter of `WINDOW`, false when they are an eighth or less.
     """
 
     def __init__(self) -> None:
@@ -23,7 +23,7 @@ class Lateness:
 
     @property
     def percent(self) -> float:
-        """Percentage of late commands among the most recent."""
+        """Percentage of late commands among the last `WINDOW` commands."""
         return 100 * self._late / len(self._last) if self._last else 0.0
 
     def add(self, late: bool) -> bool:

@@ -10,12 +10,12 @@ from lowfc.optics.detector.detector import Detector, saturation_dn
 
 @dataclass(frozen=True, eq=False)
 class PixelErrors:
-    """Errors of the pixels (rows, columns).
+    """Errors of the pixels; `gain` and `hot_e` are (rows, columns).
 
     Attributes:
         gain: response to light, 1 on average.
-        hot_e: dark-current electrons of hot pixels in an exposure, 0 elsewhere.
-        response_dn: (65536,) output for each digital number of a linear detector.
+        hot_e: dark-current electrons of hot pixels in an exposure, 0 in other pixels.
+        response_dn: (65536,) output, DN, for each output of a linear detector.
     """
 
     gain: Single
@@ -38,7 +38,7 @@ def pixel_errors(
         detector: the detector without errors.
         shape: rows and columns.
         seed: seed of gains and hot pixels.
-        nonuniformity: rms of the gains.
+        nonuniformity: rms of the gain errors.
         nonlinearity: fraction by which the response to faint light exceeds that at full well.
         hot_pixels: fraction of pixels that are hot.
         hot_pixel_e: mean dark-current electrons of a hot pixel in an exposure.
@@ -52,7 +52,7 @@ def pixel_errors(
 
 
 def response(detector: Detector, nonlinearity: float) -> Pixels:
-    """Output (65536,) for each linear digital number: the signal s becomes s (1 + nonlinearity (1 - s / full))."""
+    """Output (65536,), DN, for each linear one: the signal s above bias becomes s (1 + nonlinearity (1 - s / full))."""
     linear = np.arange(1 << 16)
     full = saturation_dn(detector) - detector.bias_dn
     signal = linear - detector.bias_dn

@@ -1,4 +1,4 @@
-"""The simulated optics: compute frame and true wavefront from the mirror's shape and the disturbance.
+"""The simulated optics: frame and true wavefront, computed from the mirror's shape and the disturbance.
 
 Time is continuous: the star moves while the mirror holds its shape. An image is the mean over its exposure. The true
 wavefront is given at the start of the exposure, and as the root mean square over the period.
@@ -25,8 +25,8 @@ GAUSS_LEGENDRE = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
 MAX_TRUTHS = 10
 """Largest number of frames for which the truth is computed together."""
 _MAX_NODES = 256
-"""Largest number of nodes, which bounds the time to compute them and a frame. The presets reach it at frame rates below
-1 Hz, fast wheels also at higher frame rates."""
+"""Largest number of nodes in an exposure; it bounds the time to compute a frame. The presets reach it at frame rates
+below 1 Hz, fast wheels also at higher frame rates."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,12 +61,12 @@ class Truth:
 
 
 def exposure_nodes(cycles: float) -> tuple[Array, Array]:
-    """Nodes in [0, 1], in exposure times, and weights of the mean over an exposure.
+    """Nodes (n,) in [0, 1], in exposure times, and their weights (n,) for the mean over an exposure.
 
-    The mean of a wave is exact to 0.5 % of its amplitude, up to 127 cycles.
+    The mean of a wave is exact to 0.5 % of its amplitude, up to 127 cycles in an exposure.
 
     Args:
-        cycles: Cycles of the fastest wave in an exposure.
+        cycles: Number of cycles of the fastest wave in an exposure.
     """
     if cycles <= 0.25:
         return GAUSS_LEGENDRE, np.full(2, 0.5)
@@ -140,7 +140,7 @@ class Scene:
         self._sampler = Sampler(disturbance, np.concatenate([[0.0], exposure * nodes, self.instants]), rate_hz)
         self._disturbance, self._rate_hz, self._exposure = disturbance, rate_hz, exposure
         self._shear_slopes = None if shear_slopes is None else shear_slopes.astype(np.float32)
-        noise_table_of(detector)  # built here so that the first frame is not late
+        noise_table_of(detector)  # computed here, so that the first frame is not late
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -169,7 +169,7 @@ class Scene:
         return self.truths([(index, actuators_nm, path)])[0]
 
     def truths(self, frames: Sequence[tuple[int, Single, MirrorMotion | None]]) -> list[Truth]:
-        """The true wavefronts of frames and of their periods; many together take less time than one by one.
+        """The true wavefronts of frames and of their periods; many frames in one call take less time than one by one.
 
         Args:
             frames: for each frame its index; the shape (rows, columns) of the mirror at the start of its exposure; and
@@ -221,7 +221,7 @@ class Scene:
         return shear_at(self._disturbance, (index + self._exposure / 2) / self._rate_hz)
 
     def _mirror_nm(self, actuators_nm: Single) -> Single:
-        """Wavefront (used,) of a shape; the last ones are cached."""
+        """Wavefront (used,) of a shape on the twin's used nodes, nm; the last wavefronts are cached."""
         for shape_nm, opd_nm in self._wavefronts:
             if shape_nm is actuators_nm:
                 return opd_nm
@@ -250,7 +250,7 @@ class Scene:
         products_nm2[fixed:, fixed:] = (mirror_nm * area) @ mirror_nm.T
         amounts = np.zeros((2, *weights.shape[:2], len(products_nm2)))
         amounts[..., : fixed - 1], amounts[..., fixed - 1], amounts[1, ..., fixed:] = disturbance_nm, 1, weights
-        # Guard nodes of the interpolation have weights below zero, and so may a sum.
+        # Guard nodes of the interpolation have weights below zero, so a sum may be below zero too.
         return np.asarray(np.maximum((amounts @ products_nm2 * amounts).sum(axis=-1), 0))
 
     def _noiseless(self, electrons: Single) -> npt.NDArray[np.uint16]:
@@ -261,7 +261,7 @@ class Scene:
         return np.asarray(np.rint(np.clip(values, 0, saturation_dn(detector))), dtype=np.uint16)
 
     def _static_screen(self, rms_nm: float, seed: int) -> Single:
-        """The preset's screen at the nodes, scaled to this rms over the open pupil, piston removed."""
+        """The static screen (used,) at the nodes, nm, scaled to this rms over the open pupil, piston removed."""
         axis = self._optics.axis
         if not rms_nm:
             return np.zeros(self._optics.used.size, np.float32)
@@ -270,7 +270,7 @@ class Scene:
         return (opd * (rms_nm / wavefront_rms_nm(self._optics, opd))).astype(np.float32)
 
     def _project(self, opd_nm: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-        """Least-squares fit of modes and piston over the circular aperture to wavefronts (used,) or (used, many)."""
+        """Modes of wavefronts (used,) or (used, n), from a fit of modes and piston over the circular aperture."""
         x, y = node_radii(self._optics)
         inside = np.hypot(x, y) <= 1
         basis = np.vstack([np.ones(inside.sum()), self._basis[:, inside]]).astype(np.float64)

@@ -7,7 +7,7 @@ import numpy as np
 from lowfc.arrays import Array, Complex
 
 ORDERS = (1.0, 2.0, 2.9, 4.4, 5.4)
-"""Frequencies of the harmonics, as multiples of the wheel's speed; those of the bearings are not integers."""
+"""Frequencies of the harmonics, as multiples of the wheel's speed; the multiples of the bearings are not integers."""
 HEIGHTS = (1.0, 0.5, 0.3, 0.2, 0.15)
 """Amplitudes of the harmonics, relative to the first."""
 SOFT_HZ = 5.0
@@ -36,9 +36,9 @@ class Wheel:
 
     Attributes:
         start_hz: speed at time 0, revolutions per second.
-        course: ramp, walk or run-down (friction proportional to the speed).
-        change: rate of change of the speed: Hz per second (run-down: the decrease at time 0), for a walk Hz per root
-            second; 0 for a constant speed.
+        course: how the speed changes: "ramp", "walk" or "run-down" (friction proportional to the speed).
+        change: for a ramp the change of the speed, for a run-down its decrease at time 0, both in Hz per second; for a
+            walk its strength, Hz per root second; 0 for a constant speed.
         amplitude_nm: (harmonics, modes) complex: amplitude and phase at high speed, nm of wavefront rms.
         wander: frequencies (waves,) and amplitudes (waves, 1) in Hz of a random walk of the speed.
     """
@@ -72,12 +72,12 @@ class Wheel:
         return self.start_hz * time_s + self.change / 2 * time_s**2
 
     def modes_nm(self, time_s: Array) -> Array:
-        """Contribution to the modes (instants, modes), nm of wavefront rms."""
+        """Contribution of the wheel to the modes (instants, modes), nm of wavefront rms."""
         phases = np.exp(2j * np.pi * np.outer(self.turns(time_s), ORDERS))
         return np.asarray((self._heights(time_s) * phases @ self.amplitude_nm).real)
 
     def lines(self) -> tuple[Array, Array]:
-        """Frequencies (harmonics,) at time 0, Hz, and the variance of each in each mode (harmonics, modes), nm^2."""
+        """Frequencies (harmonics,) at time 0, Hz, and the variance of each mode at them (harmonics, modes), nm^2."""
         variance_nm2 = np.abs(self._heights(np.zeros(1)).T * self.amplitude_nm) ** 2 / 2
         return np.array(ORDERS) * self.start_hz, variance_nm2
 

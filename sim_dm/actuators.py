@@ -5,7 +5,7 @@ import numpy as np
 from lowfc.arrays import Array, Single
 
 PLAY_NM = (1.0, 4.0, 16.0, 64.0, 256.0)
-"""Half widths of the play operators, nm of surface: hysteresis for moves of any size."""
+"""Half widths of the play operators, nm of surface; their range gives hysteresis in small and large moves."""
 CREEP_S = (0.1, 1.0, 10.0, 100.0)
 """Time constants of the creep, a decade apart, so that creep grows with the logarithm of time."""
 
@@ -33,7 +33,7 @@ class Actuators:
         self._crept_nm = np.zeros((len(CREEP_S), *grid))
 
     def reach(self, driven_nm: Single, elapsed_ns: float) -> Single:
-        """Positions reached (rows, columns) after this command has been applied for `elapsed_ns`."""
+        """Positions (rows, columns) after this command has been applied for `elapsed_ns`, nm of surface."""
         position_nm: Array = driven_nm * self._gain
         if self._hysteresis:
             width_nm = np.array(PLAY_NM)[:, None, None]

@@ -14,10 +14,10 @@ class SimulatedMirror:
     """The mirror that the section [mirror] of a configuration describes."""
 
     def __init__(self, options: DriverOptions, config: Configuration) -> None:
-        """Start flat except for stuck actuators."""
+        """Start with a flat surface except at stuck actuators."""
         section, self.geometry = config.mirror, geometry(config)
         grid = section.rows, section.columns
-        fixed_nm = {**dict.fromkeys(section.dead, 0.0), **{int(at): height for at, height in section.stuck_nm.items()}}
+        fixed_nm = {**dict.fromkeys(section.dead, 0.0), **{int(index): nm for index, nm in section.stuck_nm.items()}}
         self._fixed, self._fixed_nm = list(fixed_nm), list(fixed_nm.values())
         self._settling_ns = section.settling_us * 1e3
         self._surface_nm = self._with_fixed(np.zeros(grid, np.float32))
@@ -29,7 +29,7 @@ class SimulatedMirror:
         return self.settle(actuators_nm, np.inf)
 
     def settle(self, actuators_nm: Single, elapsed_ns: float) -> Single:
-        """Positions of the actuators after a first-order response over `elapsed_ns`; see `MirrorExtras.settle`."""
+        """Surface at the actuators, nm, after a first-order response over `elapsed_ns`; see `MirrorExtras.settle`."""
         step = np.float32(self.geometry.step_nm)
         reached_nm = actuators_nm / step
         np.rint(reached_nm, out=reached_nm)

@@ -1,4 +1,4 @@
-"""A clock that only the test advances."""
+"""A clock that stands still until a test advances it."""
 
 from lowfc.adapters.process.clock import SIMULATED_START_NS, HostClock
 
@@ -6,7 +6,7 @@ _NS = 1_000_000_000
 
 
 class FakeClock(HostClock):
-    """Clock for tests: host and run have the same time, which only `advance` and `sleep_until_ns` change."""
+    """Clock for tests: host time and run time are the same, and only `advance` and `sleep_until_ns` change it."""
 
     offset_ns = 0
 

@@ -25,7 +25,7 @@ class MemoryHub:
     """Connects the buses of one test; `lose` decides whether a message to a role is lost."""
 
     buses: "list[MemoryBus]" = field(default_factory=list)
-    starts: dict[str, int] = field(default_factory=dict)  # of the newest bus of each role, s
+    starts: dict[str, int] = field(default_factory=dict)  # start time of the newest bus of each role, Unix seconds
     lose: Callable[[str, str, Envelope], bool] = lambda role, key, envelope: False
 
 
@@ -58,7 +58,7 @@ class MemoryPublisher:
 
 
 class MemoryRing:
-    """Ring buffer; see `Ring`, but `receive_time_ns` is the time of the put. It is closed once nobody refers to it."""
+    """Ring buffer as `Ring`, but `receive_time_ns` is the time of the put. It is closed once nothing refers to it."""
 
     def __init__(self, bus: "MemoryBus", topic: Topic, capacity: int) -> None:
         self.waiting: deque[Sample] = deque(maxlen=capacity)
@@ -158,7 +158,7 @@ class MemoryBus:
                 self.call("handler of", pattern, handler, _sample(key, payload, envelope, self.clock))
 
     def call(self, what: str, key: str, handler: Callable[[T], None], argument: T) -> bool:
-        """Call a handler; return False if it raised. A fault counts for its own process, not the publisher's."""
+        """Call a handler; return False if it raised. The exception is counted in `faults` of this bus."""
         try:
             handler(argument)
         except Exception as fault:

@@ -173,7 +173,7 @@ def test_region_is_read_at_the_centre_of_the_sensor() -> None:
     camera.start()
     exposure = camera.expose()
     assert np.array_equal(exposure.pixels, PIXELS[8:72, 15:65])
-    with pytest.raises(ConfigurationError, match="rows is 81, the sensor has 80"):
+    with pytest.raises(ConfigurationError, match="rows is 81, the sensor has only 80"):
         camera_of(Configuration(), rows=81)
 
 

@@ -188,7 +188,7 @@ class LiveView:
     def _renew(self, why: str) -> None:
         """Restart with a new viewer on the same ports.
 
-        It raises ViewError after too many restarts, or if the view is written to a file: the file is kept, but it cannot
+        It raises ViewError after too many restarts, or if the view is written to a file: this file is kept, but cannot
         be continued.
         """
         if self.viewer is None:

@@ -54,7 +54,7 @@ _UNREADABLE = (BadMessageError, DecodeError, KeyError, OverflowError, ValueError
 
 
 class Wavefronts(NamedTuple):
-    """Residual wavefronts of frames, and `open` ones, with a flat mirror: all true or all measured.
+    """Residual wavefronts of frames, and the wavefronts with a flat mirror (`open`): all true or all measured.
 
     `residual_nm` and `open_nm` (frames, modes): modes; the true ones are those at the start of each exposure.
     `residual_rms_nm` and `open_rms_nm` (frames, modes): rms of each mode over the frame period if it is known,

@@ -64,7 +64,7 @@ class SteadyFrames:
         return True
 
     def rows(self) -> tuple[Sequences, Single]:
-        """Sequence of each frame; error and pseudo-open-loop (frames, 2 x modes), nm. Only after a `feed` that was true."""
+        """Sequence of each frame; error and pseudo-open-loop (frames, 2 x modes). Only after a `feed` that was true."""
         sequence, signals = (np.concatenate(column) for column in zip(*self._kept, strict=True))
         return sequence, signals
 
