@@ -1,4 +1,4 @@
-"""Behaviour common to the memory bus and the zenoh bus; zenoh's links, passwords, stopped readers and session ends."""
+"""Behaviour common to the memory bus and the zenoh bus; zenoh's links, passwords, slow readers and session ends."""
 
 import itertools
 import json
@@ -39,7 +39,7 @@ Join = Callable[..., ZenohBus]
 def _runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     with tempfile.TemporaryDirectory(prefix="bus-") as path:  # a path short enough for Unix sockets
         monkeypatch.setenv("XDG_RUNTIME_DIR", path)
-        monkeypatch.setenv("ZENOH_RUNTIME", "")  # so that pytest removes what a monitor sets here
+        monkeypatch.setenv("ZENOH_RUNTIME", "")  # so that pytest removes the value that a monitor sets
         monkeypatch.delenv("ZENOH_RUNTIME")
         yield
 
@@ -84,7 +84,7 @@ def test_a_put_reaches_every_subscriber_of_its_key(pair: tuple[Bus, Bus]) -> Non
 def test_closing_a_link_does_not_block_its_process(join: Join) -> None:
     buses = [join(role) for role in ("controller", "camera")]
     until(lambda: all(bus.peers() for bus in buses))
-    until(lambda: not any(socket_options(socket.SOL_SOCKET, socket.SO_LINGER)))  # with it, closing waits up to 10 s
+    until(lambda: not any(socket_options(socket.SOL_SOCKET, socket.SO_LINGER)))  # with it, a close waits up to 10 s
 
 
 def test_a_query_returns_the_last_message_with_its_envelope(pair: tuple[Bus, Bus]) -> None:
@@ -113,7 +113,7 @@ def test_a_query_may_be_answered_later_from_another_thread(pair: tuple[Bus, Bus]
     answers: list[Sample] = []
 
     def ask() -> None:
-        while not answers:  # queries reach nobody until the link is up
+        while not answers:  # a query sent before the link is up reaches nobody
             answers.extend(operator.get("lowfc/request/gain", b"0.5", timeout_s=PATIENCE_S))
 
     asker = threading.Thread(target=ask)
@@ -189,7 +189,7 @@ def test_sessions_without_the_password_receive_and_send_nothing(run: Run, join: 
     assert (overheard, forgeries.received) == ([], 0)
 
 
-def test_messages_without_a_valid_envelope_are_counted_without_traceback(
+def test_messages_without_a_valid_envelope_are_counted_and_print_no_traceback(
     run: Run, join: Join, capfd: pytest.CaptureFixture[str]
 ) -> None:
     controller = join("controller")
@@ -285,7 +285,7 @@ def test_a_monitor_receives_every_truth_and_frames_at_display_rate(join: Join) -
 
 # A recorder that drains its ring on request, and prints how many messages it received so far, how many of these are
 # complete, and the number in the last complete message.
-READER = """
+RECORDER = """
 import sys
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
@@ -308,7 +308,7 @@ class Reader:
 
     def __init__(self, run: Run, camera: ZenohBus) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-c", READER, run.run_id], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [sys.executable, "-c", RECORDER, run.run_id], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
         self.camera = camera
         self.frames = camera.publisher(FRAME)
@@ -335,7 +335,7 @@ def reader(run: Run, join: Join) -> Iterator[Reader]:
     recorder.process.communicate()
 
 
-def test_a_stopped_subscriber_does_not_delay_the_others(reader: Reader, join: Join) -> None:
+def test_a_suspended_subscriber_does_not_delay_the_others(reader: Reader, join: Join) -> None:
     box = Mailbox()
     join("controller").subscribe(FRAME, box.put)
     until(lambda: box.take(0.01), each=reader.put)
@@ -376,13 +376,13 @@ def test_a_session_ends_although_a_handler_never_returns(join: Join, monkeypatch
     free.set()
 
 
-def test_a_session_ends_soon_while_another_process_is_stopped(run: Run) -> None:
-    """The host accepts connections for the camera's stopped process; `lowfc ctl safe` must end all the same."""
+def test_a_session_ends_soon_while_another_process_is_suspended(run: Run) -> None:
+    """The host accepts connections for a suspended camera; `lowfc ctl safe` must end soon nevertheless."""
     with socket.create_server(("127.0.0.1", run.links.ports["camera"])):
         operator = ZenohBus(run.links, "operator", HostClock())
         begun_s = time.monotonic()
         operator.close()
-    assert time.monotonic() - begun_s < CLOSE_S, "the session closed before the timeout of `close`"
+    assert time.monotonic() - begun_s < CLOSE_S, "the session should have closed before the timeout of `close`"
 
 
 def test_each_use_of_a_key_on_a_closed_bus_raises_a_bus_error(run: Run) -> None:
@@ -390,7 +390,7 @@ def test_each_use_of_a_key_on_a_closed_bus_raises_a_bus_error(run: Run) -> None:
     bus.close()
     for use in (
         lambda: bus.publisher(COMMAND, "dm"),
-        lambda: bus.subscribe(FRAME, Mailbox().put),  # subscribes over a direct link, too
+        lambda: bus.subscribe(FRAME, Mailbox().put),  # the controller receives frames over a direct link too
         lambda: bus.subscribe(HEALTH, Mailbox().put),
         lambda: bus.ring(HEALTH, 1),
         lambda: bus.queryable(REQUEST_KEY.format(name="*"), Mailbox().put),
@@ -400,7 +400,7 @@ def test_each_use_of_a_key_on_a_closed_bus_raises_a_bus_error(run: Run) -> None:
             use()
 
 
-def test_a_fault_is_counted_also_if_standard_error_cannot_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_handlers_error_is_counted_even_if_standard_error_cannot_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", Mock(write=Mock(side_effect=OSError("disk full"))))
     faults = Faults()
     faults.add("camera: handler of", "lowfc/frame", RuntimeError("broken"))

@@ -24,7 +24,7 @@ PATIENCE_S = 30.0
 
 
 class LinkedRun:
-    """A run with its buses; `receive` keeps each message's sequence count, size and receiving thread."""
+    """A run with its buses; `receive` keeps the sequence count, the size and the receiving thread of each message."""
 
     def __init__(self, base: Path) -> None:
         self.run: Run = open_run("direct-link", base=base)
@@ -83,7 +83,7 @@ def test_the_direct_subscriber_receives_over_the_direct_link_and_others_over_the
     assert recorded[-100:] == linked.received[-100:]
 
 
-def test_a_reader_in_the_same_process_receives_each_message_by_a_call(linked: LinkedRun) -> None:
+def test_a_reader_in_the_publishers_process_receives_each_message_by_a_call(linked: LinkedRun) -> None:
     controller, recorder = linked.bus("controller"), linked.bus("recorder")
     controller.subscribe(FRAME, linked.receive)
     recorded: list[int] = []
@@ -94,7 +94,7 @@ def test_a_reader_in_the_same_process_receives_each_message_by_a_call(linked: Li
     linked.publish(frames, 100)
     until(lambda: recorded[-1:] == [99])
     camera.close()
-    assert linked.received == list(range(100)), "each message once, although the bus carried it too"
+    assert linked.received == list(range(100)), "each message should arrive once, although the bus carried it too"
     assert set(linked.threads) == {threading.current_thread().name}
     del linked.threads[:]
     separate = linked.bus("camera").publisher(FRAME)  # as in a separate process
@@ -109,7 +109,7 @@ def test_switching_to_the_direct_link_loses_and_repeats_nothing(linked: LinkedRu
     until(lambda: controller.peers() and camera.peers())
     linked.publish(frames, 250)
     until(lambda: linked.received[-1:] == [frames.published - 1])
-    first = min(linked.received)  # it may arrive over the socket after later ones arrived over the bus
+    first = min(linked.received)  # over the socket, it may arrive after later messages that the bus delivered
     assert sorted(linked.received) == list(range(first, frames.published))
     assert [number for number in linked.received if number != first] == list(range(first + 1, frames.published))
     assert "direct-link" in linked.threads
@@ -187,14 +187,14 @@ def test_messages_that_a_publisher_repeats_or_reorders_are_delivered_as_they_wer
         reader.by_socket(sequence, time_ns)
         if not direct_only:
             reader.by_bus(sequence, time_ns)
-    # The same envelope twice: without the bus both are delivered; in parallel with it, the second counts as a copy.
+    # The same envelope twice: with the socket alone both are delivered; with the bus, the second counts as a copy.
     copies = 2 if direct_only else 1
     for _ in range(copies):
         reader.by_socket(13, 9)
     assert reader.delivered == [10, 12, 11, 11, 3, *[13] * copies]
 
 
-def test_reader_and_writer_reconnect_after_restarts_and_the_bus_serves_without_a_writer(
+def test_reader_and_writer_reconnect_after_restarts_and_without_a_writer_the_bus_delivers(
     linked: LinkedRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     controller, camera = linked.bus("controller"), linked.bus("camera")
@@ -241,7 +241,7 @@ def test_a_stalled_reader_never_blocks_the_writer(tmp_path: Path) -> None:
     listener.close()
 
 
-def test_an_invalid_message_is_counted_and_the_next_is_delivered(
+def test_invalid_messages_are_counted_and_the_next_message_is_delivered(
     linked: LinkedRun, capfd: pytest.CaptureFixture[str]
 ) -> None:
     controller = linked.bus("controller")
@@ -267,7 +267,7 @@ def test_only_direct_subscribers_have_a_direct_link(linked: LinkedRun) -> None:
 
 
 class CommandedMirror:
-    """A mirror that records its commands, with a controller and an operator that both publish commands."""
+    """A mirror that keeps the commands it receives; a controller and an operator both publish commands."""
 
     def __init__(self, linked: LinkedRun) -> None:
         self.received: list[Sample] = []
@@ -305,15 +305,15 @@ def test_a_mirror_receives_each_command_once_and_those_of_the_controller_over_th
     until(
         lambda: newest <= {(sample.payload, count_of(sample.sequence)) for sample in mirror.received[received_before:]}
     )
-    time.sleep(0.1)  # by then, a copy over the bus would have arrived
-    by_publisher = list(zip(mirror.received, mirror.threads, strict=True))[received_before:]
+    time.sleep(0.1)  # a copy over the bus would have arrived by then
+    samples_and_threads = list(zip(mirror.received, mirror.threads, strict=True))[received_before:]
     for payload, last_count in zip((b"controller", b"operator"), last, strict=True):
-        counts = [count_of(sample.sequence) for sample, _ in by_publisher if sample.payload == payload]
+        counts = [count_of(sample.sequence) for sample, _ in samples_and_threads if sample.payload == payload]
         assert counts[-100:] == list(range(last_count - 99, last_count + 1))
         assert len(counts) == len(set(counts))
-    direct = [name == "direct-link" for sample, name in by_publisher if sample.payload == b"controller"]
-    assert any(direct)  # for some commands the bus may be faster
-    assert all(name != "direct-link" for sample, name in by_publisher if sample.payload == b"operator")
+    direct = [name == "direct-link" for sample, name in samples_and_threads if sample.payload == b"controller"]
+    assert any(direct)  # not all: for some commands the bus may be faster
+    assert all(name != "direct-link" for sample, name in samples_and_threads if sample.payload == b"operator")
     copied = next(sample for sample in reversed(mirror.received) if sample.payload == b"controller")
     mirror.operator.put(b"a copy", publish_time_ns=copied.publish_time_ns, sequence=copied.sequence)
     mirror.operator.put(b"another", sequence=copied.sequence)
@@ -334,7 +334,7 @@ def test_handed_ns_is_before_the_bus_put_if_there_is_a_direct_reader_and_after_i
 
 
 def test_no_message_is_delivered_twice_after_a_stall_in_which_the_bus_was_ahead(tmp_path: Path) -> None:
-    """A socket buffers at most a few thousand commands, fewer than the reader remembers."""
+    """A socket buffers at most a few thousand commands, fewer than the envelopes that the reader keeps."""
     reader, commands = ReaderOnTwoPaths(tmp_path / "mirror-dm.in", shared=True), 5000
     for count in range(commands):
         reader.by_bus(sequence_of(5, count), count)

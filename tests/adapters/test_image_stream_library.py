@@ -1,4 +1,4 @@
-"""ImageStreamIO streams, tested with the C library, if the loader finds libImageStreamIO.so."""
+"""ImageStreamIO streams, tested with the C library; skipped if the loader does not find libImageStreamIO.so."""
 
 import ctypes
 import multiprocessing
@@ -13,6 +13,7 @@ from lowfc.adapters.image_stream.reader import StreamReader
 from lowfc.adapters.image_stream.stream import Stream
 
 ROWS, COLUMNS = 34, 31
+UINT16, FLOAT = 3, 9  # the C library's numbers of pixel types
 try:
     LIBRARY = ctypes.CDLL("libImageStreamIO.so")
 except OSError:
@@ -44,7 +45,7 @@ class Image:
         return np.frombuffer(memory, dtype).reshape(ROWS, COLUMNS)
 
     def write(self, image: np.ndarray) -> None:
-        ctypes.c_uint8.from_address(self.pointer(120) + 288).value = 1  # `write` in the metadata: being written
+        ctypes.c_uint8.from_address(self.pointer(120) + 288).value = 1  # field `write`: an image is being written
         self.pixels(image.dtype.str)[:] = image
         assert not LIBRARY.ImageStreamIO_UpdateIm(self.memory)
 
@@ -62,8 +63,8 @@ def image(seed: int, dtype: str) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 1000, (ROWS, COLUMNS)).astype(dtype)
 
 
-def test_images_of_the_c_library_are_read(path: Path) -> None:
-    library = Image(path.name.removesuffix(".im.shm")).create(3, keywords=4)
+def test_images_written_by_the_c_library_are_read(path: Path) -> None:
+    library = Image(path.name.removesuffix(".im.shm")).create(UINT16, keywords=4)
     reader = StreamReader(path)
     for number in range(1, 100):
         library.write(image(number, "u2"))
@@ -71,14 +72,14 @@ def test_images_of_the_c_library_are_read(path: Path) -> None:
         assert received.number == number
         assert abs(received.acquired_ns - time.time_ns()) < 10**9
         assert np.array_equal(received.pixels, image(number, "u2"))
-    assert LIBRARY.ImageStreamIO_semvalue(library.memory, 9) == 10
+    assert LIBRARY.ImageStreamIO_semvalue(library.memory, 9) == 10  # no reader waits on it: it stays at its maximum
     reader.close()
     LIBRARY.ImageStreamIO_destroyIm(library.memory)
     assert reader.next(0.02) is None
 
 
 def test_the_c_library_does_not_take_the_semaphore_of_a_lowfc_reader(path: Path) -> None:
-    library = Image(path.name.removesuffix(".im.shm")).create(3)
+    library = Image(path.name.removesuffix(".im.shm")).create(UINT16)
     reader = StreamReader(path)
     context = multiprocessing.get_context("fork")
     queue = context.SimpleQueue()
@@ -99,10 +100,10 @@ def _receive(name: str, images: int, started: Any, queue: Any) -> None:
 
 
 @pytest.mark.parametrize("made_by", ["library", "lowfc"])
-def test_images_of_lowfc_wake_readers_of_the_c_library(path: Path, made_by: str) -> None:
+def test_images_written_by_lowfc_wake_readers_that_use_the_c_library(path: Path, made_by: str) -> None:
     name = path.name.removesuffix(".im.shm")
     if made_by == "library":
-        Image(name).create(9, ring=3)
+        Image(name).create(FLOAT, ring=3)
         stream = Stream(path)
     else:
         stream = Stream.create(path, (ROWS, COLUMNS), np.float32)
@@ -118,15 +119,16 @@ def test_images_of_lowfc_wake_readers_of_the_c_library(path: Path, made_by: str)
     assert child.exitcode == 0
 
 
-def test_the_ring_buffer_is_written_as_by_the_c_library(path: Path) -> None:
+def test_lowfc_writes_the_ring_buffer_as_the_c_library_does(path: Path) -> None:
     name = path.name.removesuffix(".im.shm")
     written = []
     for by_library in (True, False):
-        library = Image(name).create(9, ring=3)
+        library = Image(name).create(FLOAT, ring=3)
         stream = Stream(path)
         put = library.write if by_library else stream.put
         for number in range(1, 6):
             put(image(number, "f4"))
         start = stream.layout.starts["ring"]
-        written.append((path.read_bytes()[start : start + 3 * ROWS * COLUMNS * 4], path.read_bytes()[296:312]))
+        content, index_and_cycle = path.read_bytes(), slice(296, 312)
+        written.append((content[start : start + 3 * ROWS * COLUMNS * 4], content[index_and_cycle]))
     assert written[0] == written[1]

@@ -1,4 +1,4 @@
-"""Damaged and rewritten logs: no crash, no message that was never sent, no loss that is not reported."""
+"""Damaged and rewritten logs: reading neither crashes, nor yields a message that was never sent, nor hides a loss."""
 
 import dataclasses
 import io
@@ -43,7 +43,7 @@ SENT = small_samples()
 
 
 def read_of(reader: LogReader) -> tuple[list[Sample], str]:
-    """Messages that a reader delivers, and the text of its error or an empty text."""
+    """Messages that a reader delivers, and the text of its error; an empty text without an error."""
     read: list[Sample] = []
     try:
         read.extend(reader)
@@ -71,15 +71,15 @@ def test_a_damaged_log_yields_no_false_message_and_no_silent_loss(tmp_path: Path
         assert len(set(read)) == len(read), case
         delivered += len(read)
         assert bool(strict_error) == bool(error or reader.damage or reader.unreadable), case
-        assert strict_error or not (finished and reader.complete), f"{case}: it counts as intact"
+        assert strict_error or not (finished and reader.complete), f"{case}: the log should not count as intact"
         if read != SENT and (finished or kind not in MISPLACED):
             truncated = not reader.complete and read == SENT[: len(read)]
-            assert strict_error or truncated, f"{case}: an unreported loss"
+            assert strict_error or truncated, f"{case}: the loss should be reported"
     assert delivered > 0.5 * len(SENT) * MUTATIONS / 2, "too little was read for a meaningful test"
 
 
 def chunk_headers(size: int, content: bytes) -> bytes:
-    """A chunk header every 64 bytes; each chunk begins with `content` and claims almost the rest of the file."""
+    """A chunk header every 64 bytes; each chunk begins with `content`, and its stated length is nearly all the rest."""
     file = b""
     for at in range(0, size, 64):
         length = max(size - at - 9, 43)
@@ -154,7 +154,7 @@ NO_CHUNKS = {"use_chunking": False}
         NO_CHUNKS,
         NO_CHUNKS | NO_CRCS,
         NO_CHUNKS | {"enable_data_crcs": True},
-        NO_CHUNKS | {"library": "lowfc 0.1.0"},  # the header names the original's library
+        NO_CHUNKS | {"library": "lowfc 0.1.0"},  # the header names the library that wrote the original
         {"compression": CompressionType.ZSTD, "library": "lowfc 0.1.0"},
     ],
     ids=str,
@@ -199,7 +199,7 @@ def test_a_log_is_recovered_on_a_file_system_without_permissions(
 
 
 @pytest.mark.parametrize("compression", CompressionType)
-@pytest.mark.parametrize("at", [8, 60])  # offset in the chunk's record: in its length, in its content
+@pytest.mark.parametrize("at", [8, 60])  # offset in the chunk's record: of its length, or of its content
 @pytest.mark.parametrize("finished", [True, False])
 def test_only_the_damaged_chunk_of_a_rewritten_log_is_lost(
     tmp_path: Path, source: Path, compression: CompressionType, at: int, finished: bool
@@ -244,7 +244,7 @@ def test_a_summary_without_checksum_is_used_up_to_a_damaged_record(
 def test_of_two_logs_in_one_file_the_first_is_read_and_the_second_reported(
     tmp_path: Path, source: Path, bytes_cut_from_each: tuple[int, int]
 ) -> None:
-    """The second is not read with the channels of the first, even if the first was truncated when its recorder died."""
+    """The second log is not read with the channels of the first, even if the first was cut when its recorder died."""
     first = (whole := source.read_bytes())[: len(whole) - bytes_cut_from_each[0]]
     second = rewritten(source, tmp_path / "second.mcap", {}).read_bytes()
     second = second[: len(second) - bytes_cut_from_each[1]]
@@ -260,7 +260,7 @@ def test_of_two_logs_in_one_file_the_first_is_read_and_the_second_reported(
     assert damage.why == f"it is another log, appended to this one; {command} copies it"
 
 
-def test_another_file_after_a_log_is_damage(source: Path) -> None:
+def test_a_file_appended_to_a_log_is_damage(source: Path) -> None:
     log = source.read_bytes()
     source.write_bytes(log + b"no log" + log[-8:])
     reader = LogReader(source, skip_damaged=True)
@@ -294,7 +294,7 @@ def test_unchunked_messages_are_covered_by_the_data_checksum_and_read_up_to_a_tr
 
 
 @pytest.mark.parametrize("skip_damaged", [True, False])
-def test_an_unsupported_compression_is_reported_as_such(tmp_path: Path, source: Path, skip_damaged: bool) -> None:
+def test_an_unsupported_compression_is_reported_with_its_name(tmp_path: Path, source: Path, skip_damaged: bool) -> None:
     path, builder = tmp_path / "rewritten.mcap", RecordBuilder()
     with rewritten(source, path, {}).open("rb") as stream:
         for record in StreamReader(stream, emit_chunks=True).records:

@@ -1,4 +1,4 @@
-"""Log files: written and read again, damaged, truncated, growing, and never overwritten."""
+"""Log files: written and read again, damaged, truncated, read while they grow, and never overwritten."""
 
 import dataclasses
 import errno
@@ -122,10 +122,10 @@ def crafted(path: Path, *records: McapRecord) -> Path:
 
 
 def chunk(*records: McapRecord, **changes: Any) -> Chunk:
-    return packed(serialised(records), **changes)
+    return lz4_chunk(serialised(records), **changes)
 
 
-def packed(content: bytes, **changes: Any) -> Chunk:
+def lz4_chunk(content: bytes, **changes: Any) -> Chunk:
     intact = Chunk("lz4", lz4.frame.compress(content), 0, 0, zlib.crc32(content), len(content))
     return dataclasses.replace(intact, **changes)
 
@@ -176,7 +176,7 @@ def test_the_summary_replaces_the_declarations_of_a_damaged_chunk(tmp_path: Path
     [
         (0, b"\x07"),  # opcode of a message index
         (0, b"\x86"),  # opcode of a private record
-        (0, b"\x03"),  # opcode of a declaration without checksum
+        (0, b"\x03"),  # opcode of a schema, which outside a chunk has no checksum
         (1, b"\x00"),  # the chunk's length, as in the next three
         (4, b"\x01"),  # 16 MB longer
         (6, b"\xff"),
@@ -215,7 +215,7 @@ def test_a_damaged_attachment_is_left_out_and_damaged_metadata_are_reported(tmp_
     path = written(tmp_path / "a.mcap", SENT[:8])
     data = path.read_bytes()
     flipped(path, data.index(b"[loop]"))
-    path.write_bytes(path.read_bytes()[: chunks_of(path)[-1][1]])  # without the summary, which also detects the damage
+    path.write_bytes(path.read_bytes()[: chunks_of(path)[-1][1]])  # without the summary, which would reveal the damage
     with pytest.raises(DataFileError, match="the checksum of an attachment is wrong"):
         list(LogReader(path))
     reader = LogReader(path, skip_damaged=True)
@@ -258,13 +258,13 @@ INVALID_LENGTHS = [
         ),
         ([DECLARED, message(1), chunk(message(2))], "outside the chunks", [0, 2]),
         ([chunk(STEPS, CHANNEL, message(0), message(1, channel=2))], "the declaration of its messages is missing", [0]),
-        *(([DECLARED, packed(content), chunk(message(2))], "is damaged", [0, 2]) for content in INVALID_LENGTHS),
+        *(([DECLARED, lz4_chunk(records), chunk(message(2))], "is damaged", [0, 2]) for records in INVALID_LENGTHS),
     ],
 )
 def test_contradictory_or_unchecked_records_are_damage(
     tmp_path: Path, records: list[McapRecord], error: str, delivered: list[int]
 ) -> None:
-    """Such a record is a differing second declaration, or has an invalid start, no checksum or an impossible length."""
+    """Such a record differs from the first declaration, or has a bad start, no checksum or an impossible length."""
     path = crafted(tmp_path / "a", *records)
     with pytest.raises(DataFileError, match=error):
         list(LogReader(path))
@@ -291,7 +291,7 @@ def test_an_invalid_declaration_in_the_summary_is_damage(tmp_path: Path) -> None
 
 def test_a_decompression_bomb_does_not_fill_the_memory(tmp_path: Path) -> None:
     zeros = bytes(60_000_000)
-    bomb = dataclasses.replace(packed(zeros), uncompressed_size=1000)
+    bomb = dataclasses.replace(lz4_chunk(zeros), uncompressed_size=1000)
     oversized = chunk(STEPS, uncompressed_size=1 << 40)
     path = crafted(tmp_path / "a", DECLARED, bomb, oversized)
     del zeros
