@@ -128,7 +128,6 @@ def test_lowfc_writes_the_ring_buffer_as_the_c_library_does(path: Path) -> None:
         put = library.write if by_library else stream.put
         for number in range(1, 6):
             put(image(number, "f4"))
-        start = stream.layout.starts["ring"]
-        content, index_and_cycle = path.read_bytes(), slice(296, 312)
-        written.append((content[start : start + 3 * ROWS * COLUMNS * 4], content[index_and_cycle]))
+        content, start = path.read_bytes(), stream.layout.starts["ring"]
+        written.append((content[start : start + 3 * ROWS * COLUMNS * 4], content[296:312]))  # ring; its index and cycle
     assert written[0] == written[1]

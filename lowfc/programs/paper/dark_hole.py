@@ -24,8 +24,7 @@ SEED = 5  # of the steps
 SETTLE = 100
 """Frames waited for after each step."""
 WINDOW = 300
-"""Frames waited for after the last step, in addition to `SETTLE`, and after the removal of the shape; twice as many are
-waited for before the first step."""
+"""Frames waited for after the last step, in addition to `SETTLE`, and after the removal of the shape."""
 STEPS_COMBINED = 5
 """Number of steps combined into one on the channel that does not shift the zero point. There the loop undoes nearly the
 whole step, so fewer steps suffice to measure the fraction."""
@@ -44,8 +43,7 @@ class ChannelResult:
 
     Attributes:
         channel_nm: (1 + steps, modes) modes of the channel's shape as the sensor sees them.
-        reaction_nm: (1 + steps, modes) the loop's command minus the part that cancels the disturbance: mean of the last
-            frames before the next change of the shape.
+        reaction_nm: (1 + steps, modes) command without the part that cancels the disturbance, at the end of each step.
         residual_nm: (2,) rms of the true residual about its mean, before the first step, and after the last one
             while the shape is applied.
     """
@@ -142,9 +140,7 @@ def apply_steps(loop: Client, step_rms_nm: float, base_nm: Array) -> tuple[dict[
     return first_frames, np.vstack([np.zeros(channel_modes_nm.shape[1]), channel_modes_nm])
 
 
-def channel_results(
-    history: History, first_frames: dict[str, list[int]], channel_modes_nm: Array
-) -> dict[str, ChannelResult]:
+def channel_results(history: History, first_frames: dict[str, list[int]], modes_nm: Array) -> dict[str, ChannelResult]:
     """Results of the channels, from the history of a simulated run and the values that `apply_steps` returned."""
     truths, sequences = history.true, history.steps.sequence
     assert truths is not None  # noqa: S101  # a simulated loop logs the truth
@@ -163,5 +159,5 @@ def channel_results(
             for end in (changed_at[0], changed_at[-1])
         ]
         stride = STEPS // (len(changed_at) - 1)
-        results[name] = ChannelResult(channel_modes_nm[::stride], means_nm, np.array(residual_nm))
+        results[name] = ChannelResult(modes_nm[::stride], means_nm, np.array(residual_nm))
     return results

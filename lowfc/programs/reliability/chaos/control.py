@@ -133,7 +133,7 @@ def _restart_in_safe_mode(bench: ChaosBench) -> None:
 
 
 INTERLOCK = {"name": "mask", "value": True, "action": "hold", "max_age_s": 1.0, "when_old": "passes"}
-FLIPS, FLOOD_VALUES, FLOOD_HZ = 40, 4000, 2000  # slow changes of the value; then values in a flood, and their rate
+FLIPS, FLOOD_VALUES, FLOOD_HZ = 40, 4000, 2000  # changes of the value, then values in a flood, and their rate
 
 
 @case(

@@ -94,7 +94,8 @@ def power_curves(spectra: Spectrum, modes: Mask, law: LawInForce | None, rate_hz
     """Frequency, Hz, and power spectra summed over `modes`, nm^2/Hz: pseudo-open-loop, error, prediction.
 
     `spectra` has a column for the error of each mode, then one for the pseudo-open-loop of each mode, all with noise.
-    `law` is None for an open loop; only an integrator has a prediction. A constant wavefront has no curves.
+    `law` is None if the loop is not closed or its law is unknown. Only an integrator has a prediction. A constant
+    wavefront has no curves.
     """
     error, pol = spectra.power_nm2_hz[:, : modes.size], spectra.power_nm2_hz[:, modes.size :]
     columns = [pol[:, modes].sum(axis=1), error[:, modes].sum(axis=1)]

@@ -44,7 +44,7 @@ _IF_ALL: dict[Reason, str] = {
 }
 """Advice if every frame is refused, where it differs from the advice in `REFUSED`."""
 _FRAME_REASONS = [reason for reason in REFUSED if reason not in (Rejection.NO_MIRROR, Rejection.HELD)]
-"""Reasons that the tile FRAMES reports; the tile LOOP reports the others."""
+"""Reasons for which the tile FRAMES may say REFUSED; the tile LOOP reports the others."""
 
 
 def frames(state: RunState) -> Tile:

@@ -12,8 +12,7 @@ from lowfc.programs.view.verdicts.steady import ResidualComparison
 from lowfc.programs.view.verdicts.tile import Level, Tile, rounded, short
 
 DIVERGING = 3.0
-"""Ratio of the residual to the wavefront with a flat mirror, above which more than the gains is wrong: the loop is
-unstable or has wrong signs."""
+"""Ratio of the residual to the wavefront with a flat mirror above which the loop is unstable or has wrong signs."""
 NEAR_BEST = 1.3
 """Ratio of the residual to the residual with the best gains, above which the gains are worth tuning."""
 NOISE_FLOOR = 0.2
