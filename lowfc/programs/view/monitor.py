@@ -43,7 +43,7 @@ class Monitor:
         self._queried_ns = 0
 
     def snapshot(self, now_ns: int, behind_s: float = 0.0) -> Snapshot:
-        """Return the data since the last call; the states of new processes follow in the next. `behind_s`: see `Snapshot`."""
+        """Return the data since the last call; the next has states of new processes. `behind_s`: see `Snapshot`."""
         while self._answers:
             self._accumulator.add(self._answers.popleft())
         for ring in self._rings.values():
