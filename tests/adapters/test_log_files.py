@@ -264,7 +264,7 @@ INVALID_LENGTHS = [
 def test_contradictory_or_unchecked_records_are_damage(
     tmp_path: Path, records: list[McapRecord], error: str, delivered: list[int]
 ) -> None:
-    """Such a record differs from the first declaration, or has a bad start, no checksum or an impossible length."""
+    """Such a record contradicts the first declaration, or has a bad start, no checksum or an impossible length."""
     path = crafted(tmp_path / "a", *records)
     with pytest.raises(DataFileError, match=error):
         list(LogReader(path))

@@ -128,7 +128,9 @@ class _Drawing:
     def finish(self, logs: Sequence[Path]) -> DrawnLogs:
         """Draw the verdict on the logs, and return the summary."""
         if self._renderer is None:
-            raise DataFileError(f"nothing to show in {', '.join(map(str, logs))}: no message that a view shows")
+            raise DataFileError(
+                f"nothing to show in {', '.join(map(str, logs))}: there is no message that a view shows"
+            )
         ended = LogEnd(
             name=logs[-1].name.partition(".")[0],
             run=self._order.run,

@@ -48,7 +48,7 @@ class _Aberration:
 
 @lru_cache(maxsize=8)
 def _aberrated(context: Context, name: str, coma: int) -> _Aberration:
-    """lambda/30 of focus and of the coma with Noll index `coma`, and the residuals after correction by one sensor."""
+    """lambda/30 of focus and of the coma with Noll index `coma`, and the residuals after correction with one sensor."""
     sensor = prepared(name)
     truth_nm = np.zeros(MODES)
     truth_nm[[NOLLS_14.index(4), NOLLS_14.index(coma)]] = sensor.optics.wavelength_nm / 30.0

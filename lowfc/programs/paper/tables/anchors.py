@@ -108,7 +108,7 @@ def _with_verdict(row: Row, allowed: float | None = None) -> list[Row]:
 
 
 def _pointing(context: Context, name: str) -> list[Row]:
-    """Rows of the tilt as in Roman's milestone, and of the means of the tilt as by SCExAO's sensor."""
+    """Rows of the tilt as in Roman's milestone, and of the tilt's means as for SCExAO's sensor."""
     rows: list[Row] = []
     nm_per_mas = tilt_nm_per_mas(2.0)
     new_row = partial(Row, name, unit="mas", modes=len(NOLLS_14))

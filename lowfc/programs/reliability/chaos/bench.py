@@ -147,7 +147,7 @@ class ChaosBench:
         self.wait(lambda: self._steps >= last, f"{count} steps")
 
     def await_settled(self, frames: int = SETTLED_FRAMES) -> None:
-        """Wait until this many frames were used with the loop closed; it restarts when the loop is not closed."""
+        """Wait for this many used frames with the loop closed; the count restarts when the loop is not closed."""
         self._closed_frames = 0
         timeout_s = WAIT_S + frames / self.config.camera.rate_hz
         self.wait(lambda: self._closed_frames >= frames, f"{frames} good frames with the loop closed", timeout_s)

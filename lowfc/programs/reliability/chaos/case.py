@@ -29,7 +29,7 @@ class Case:
         fault: kind of the fault that the camera is started with; empty for none.
         config: values that the case sets in the configuration, by key.
         expected: beginnings of the messages of events that must be in the log.
-        allowed: names of events of the level ERROR that may be in the log.
+        allowed: names of events of the level ERROR or above that may be in the log besides the expected ones.
         ends_safe: whether the loop must end in safe mode with a flat mirror, not closed with the former residual.
         is_bad: whether the frame with a given number must be refused; None if all frames may be used.
         statuses: exit status other than 0 with which a process may end, by name of the process.

@@ -64,7 +64,7 @@ class SteadyFrames:
         return True
 
     def rows(self) -> tuple[Sequences, Single]:
-        """Sequence of each frame; error and pseudo-open-loop (frames, 2 x modes). Only after a `feed` that was true."""
+        """Sequence of each frame; error and pseudo-open-loop (frames, 2 x modes). Only after `feed` returned True."""
         sequence, signals = (np.concatenate(column) for column in zip(*self._kept, strict=True))
         return sequence, signals
 
@@ -83,7 +83,7 @@ class ResidualComparison(NamedTuple):
 def compare_with_best_gains(
     steady: SteadyFrames, rate_hz: float, camera: wire.CameraState | None
 ) -> ResidualComparison | None:
-    """Residuals of the last frames; None if the loop is not closed, its law is unknown, or too few are in a row."""
+    """Compare residuals; None if the loop is not closed, its law is unknown, or too few frames follow each other."""
     law, modes = steady.law, len(steady.law.gain) if steady.law is not None else 0
     if law is None or steady.mode != LoopMode.CLOSED or not rate_hz:
         return None
