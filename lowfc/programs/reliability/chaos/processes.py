@@ -83,14 +83,14 @@ def _at_random(bench: ChaosBench) -> None:
 
 @process_case("stall-recorder", "the recorder is stopped (SIGSTOP) for 10 s")
 def _stalled_recorder(bench: ChaosBench) -> None:
-    compare(bench, partial(bench.stopped, Role.RECORDER))
+    compare(bench, partial(bench.suspended, Role.RECORDER))
 
 
 @process_case("stall-viewer", "the viewer is stopped (SIGSTOP) for 10 s")
 def _stalled_viewer(bench: ChaosBench) -> None:
     name = bench.process(Role.VIEWER)
     bench.await_settled()
-    compare(bench, partial(bench.stopped, name))
+    compare(bench, partial(bench.suspended, name))
 
 
 class CommandTimes:
