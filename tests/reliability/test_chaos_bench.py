@@ -143,7 +143,7 @@ def test_every_killed_or_stopped_process_continues_in_the_random_case() -> None:
     actions = " ".join(done[0] for done in mock_bench.mock_calls if done[0] != "pause")
     stopped = r"stopped stopped\(\).__enter__ stopped\(\).__exit__"
     assert re.fullmatch(rf"((kill restart|{stopped})( |$)){{{processes.RANDOM_FAULTS}}}", actions)
-    assert mock_bench.stopped.called
+    assert mock_bench.suspended.called
     assert mock_bench.kill.call_args_list == mock_bench.restart.call_args_list != []
 
 
