@@ -18,7 +18,7 @@ from lowfc.programs.view.verdicts.steady import ResidualComparison
 from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict
 from lowfc.programs.view.verdicts.verdict import judge
 from lowfc.programs.view.verdicts.watcher import Watcher
-from lowfc.programs.view.verdicts.wavefront_verdict import merit, reduction_of
+from lowfc.programs.view.verdicts.wavefront_verdict import level_and_reason, reduction_of
 from tests.support.report_log import SyntheticLog
 from tests.support.stage import NM_PER_MAS, Stage, Tape, tile
 from tests.support.toy import START
@@ -369,7 +369,7 @@ def test_a_view_that_is_behind_does_not_report_the_run_as_dead() -> None:
 def test_a_loop_is_good_if_it_corrects_and_other_gains_would_not_do_better(
     improvement: float, comparison: ResidualComparison | None, level: Level
 ) -> None:
-    assert merit(improvement, comparison)[0] is level
+    assert level_and_reason(improvement, comparison)[0] is level
 
 
 def test_noise_is_subtracted_before_a_measured_wavefront_is_judged() -> None:

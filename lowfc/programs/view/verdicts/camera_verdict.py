@@ -52,8 +52,8 @@ def frames(state: RunState) -> Tile:
     tile, camera, silent_s = partial(Tile, "FRAMES"), state.camera, state.frame_silent_s
     controller = state.snapshot.controller
     relaxes = controller is not None and controller.settings.on_frame_timeout == "flat"
-    harm = "the mirror relaxes to flat" if relaxes else "the loop holds"
-    gone = absent("FRAMES", "camera", camera, state.running_s, harm)
+    effect = "the mirror relaxes to flat" if relaxes else "the loop holds"
+    gone = absent("FRAMES", "camera", camera, state.running_s, effect)
     if gone is not None and camera.life is not Liveness.SILENT:  # a silent one is reported below
         return gone
     if camera.life is Liveness.STARTING:
@@ -62,7 +62,7 @@ def frames(state: RunState) -> Tile:
         alive = camera.life is not Liveness.SILENT and silent_s > HEALTH_OVERDUE_S
         cause = "the camera runs, but sends none" if alive else "camera silent"
         since = duration(silent_s)
-        advice = f"No frame for {since}, {cause}: {harm}. Check the camera's last output and restart it."
+        advice = f"No frame for {since}, {cause}: {effect}. Check the camera's last output and restart it."
         return tile("NO FRAMES", f"for {since}: {cause}", Level.BAD, advice)
     lost = state.recent["skipped"] + state.recent["missing"]
     period_ns = state.snapshot.period_ns

@@ -49,7 +49,7 @@ def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
         advice = f"The loop does harm: {residual} nm rms, {flat}. {remedy} or open the loop."
         return tile(value, f"worse than {flat}; {remarks}", level, advice)
     noise_nm = comparison.noise_nm if comparison is not None and not state.true else 0.0
-    level, why = merit(reduction_of(rms.residual_nm, rms.open_nm, noise_nm), comparison)
+    level, why = level_and_reason(reduction_of(rms.residual_nm, rms.open_nm, noise_nm), comparison)
     compared = f"{reduction:.1f} x better than" if reduction >= 1 else "of"
     advice = f"The residual of the last second is {value}, compared with {flat}{why}."
     return tile(value, f"{compared} {flat}; {remarks}", level, advice)
@@ -75,7 +75,7 @@ def reduction_of(residual_nm: float, open_nm: float, noise_nm: float) -> float:
     return open_nm / residual_nm
 
 
-def merit(reduction: float, comparison: ResidualComparison | None) -> tuple[Level, str]:
+def level_and_reason(reduction: float, comparison: ResidualComparison | None) -> tuple[Level, str]:
     """Level of a closed loop that does no harm, and the reason if it is not good."""
     good = correction(1.0, reduction) is Correction.GOOD
     if comparison is None:
