@@ -64,9 +64,9 @@ class PictureRun(ChaosBench):
         self.restart(Role.CAMERA, [*self.children[Role.CAMERA].command, "--config", str(file)], ready=False)
 
     def stop_controller_repeatedly(self) -> None:
-        """Stop the controller twelve times, for 40 ms each."""
+        """Suspend the controller twelve times, for 40 ms each."""
         for _ in range(12):
-            with self.stopped(Role.CONTROLLER):
+            with self.suspended(Role.CONTROLLER):
                 time.sleep(0.04)
             time.sleep(0.3)
 

@@ -164,7 +164,7 @@ def test_a_stall_is_compared_with_the_time_before_and_after(monkeypatch: pytest.
 
     monkeypatch.setattr(processes, "time", SimpleNamespace(sleep=pass_time))
     latency_us["now"] = 100
-    stub: Any = SimpleNamespace(bus=bus, outcome=SimpleNamespace(measurements=measurements), stopped=stall)
+    stub: Any = SimpleNamespace(bus=bus, outcome=SimpleNamespace(measurements=measurements), suspended=stall)
     CASES["stall-recorder"].act(stub)
     each = {name: {"frames": 3, "p50_us": us, "p99_us": us} for name, us in (("before", 100.0), ("during", 300.0))}
     each["after"] = {"frames": 3, "p50_us": 200.0, "p99_us": 200.0}
