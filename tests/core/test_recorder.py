@@ -63,7 +63,7 @@ def test_a_log_is_kept_only_if_the_run_had_another_process(tmp_path: Path, camer
     thread = threading.Thread(target=recorder.run, daemon=True)
     thread.start()
     until(lambda: list(folder.glob("*.part")))
-    if camera_present:  # a camera without Health that starts after the recorder
+    if camera_present:  # a camera that publishes no Health and starts after the recorder
         MemoryBus(hub, "camera", clock).publisher(FRAME).put(b"a frame")
     recorder.service.stop("end of the test")
     thread.join(PATIENCE_S)
@@ -71,7 +71,7 @@ def test_a_log_is_kept_only_if_the_run_had_another_process(tmp_path: Path, camer
     assert len(recorder.service.health().recording.files) == camera_present
 
 
-def test_the_health_of_a_recorder_of_many_logs_names_the_newest_ones_and_is_accepted(tmp_path: Path) -> None:
+def test_the_health_of_a_recorder_of_many_logs_names_the_newest_logs_and_is_accepted(tmp_path: Path) -> None:
     hub, clock = MemoryHub(), HostClock()
     recorder = Recorder(MemoryBus(hub, "recorder", clock), clock, "bnch", tmp_path / "logs", metadata={})
     recorder._series.files += [tmp_path / "logs" / f"20260101T000000Z-{number}.mcap" for number in range(5000)]
@@ -118,8 +118,8 @@ def test_the_state_of_the_camera_is_queried_before_the_first_log_begins(
 
 
 def test_every_lost_message_is_counted(bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (started_in := tmp_path / "here").mkdir()
-    monkeypatch.chdir(started_in)
+    (working_folder := tmp_path / "here").mkdir()
+    monkeypatch.chdir(working_folder)
     frames, steps = bench.camera.publisher(FRAME), bench.controller.publisher(STEP)
 
     def lose(role: str, key: str, envelope: Envelope) -> bool:
@@ -128,8 +128,8 @@ def test_every_lost_message_is_counted(bench: Bench, tmp_path: Path, monkeypatch
 
     bench.hub.lose = lose
     bench.start()
-    started_in.rmdir()  # the recorder does not need its working directory
-    put(frames, 50)  # the last one is lost too: only the camera's Health reveals it
+    working_folder.rmdir()  # the recorder does not need its working directory
+    put(frames, 50)  # the last frame is lost too: only the camera's Health reveals it
     put(steps, 5)  # no step arrives
     summary = bench.stop()
     assert summary.lost == {FRAME.key: 4, STEP.key: 5}
@@ -162,7 +162,7 @@ def entry(topic: Topic, count: int, start_s: int = 100, payload: bytes = b"", ke
 
 def test_the_loss_account_counts_gaps_from_the_first_message_of_each_start() -> None:
     account = LossAccount()
-    for count in (5, 6, 9, 9, 4):  # a duplicate, or one older than the first, fills no gap
+    for count in (5, 6, 9, 9, 4):  # a duplicate, or a message older than the first, fills no gap
         account.enter(*entry(FRAME, count), recorded=True)
     assert account.lost() == {FRAME.key: 2}
     for count in (3, 5):
@@ -183,11 +183,11 @@ def test_a_late_message_is_removed_from_the_losses() -> None:
     account.enter(*entry(FRAME, 8), recorded=False)  # not written to the disk
     assert (account.lost(), account.newly_lost(), account.recorded()) == ({FRAME.key: 1}, {}, {FRAME.key: 4})
     account.enter(*entry(FRAME, 12), recorded=True)
-    assert (account.lost(), account.newly_lost()) == ({FRAME.key: 3}, {FRAME.key: 1}), "two losses were reported"
+    assert (account.lost(), account.newly_lost()) == ({FRAME.key: 3}, {FRAME.key: 1}), "two were already reported"
 
 
 def reconcile(account: LossAccount, published: int, state: str = "", missing: int = 0, start_s: int = 100) -> None:
-    """Reconcile with a Health of a camera that published and missed these numbers of frames."""
+    """Reconcile the account with the Health of a camera that published `published` frames and missed `missing`."""
     message = wire.Health(process="camera", state=state)
     message.topics.add(topic=FRAME.key, published=published, missing=missing)
     message.topics.add(topic=STEP.key, received=9)
@@ -198,12 +198,12 @@ def reconcile(account: LossAccount, published: int, state: str = "", missing: in
 def test_frames_that_the_camera_missed_before_publishing_are_not_losses() -> None:
     account = LossAccount()
     account.enter(*entry(FRAME, 50), recorded=True)
-    reconcile(account, 51, missing=7)  # missed before the first frame received
+    reconcile(account, 51, missing=7)  # missed before the first frame that the recorder received
     account.enter(*entry(FRAME, 53), recorded=True)
     reconcile(account, 54, missing=9)
     assert (account.lost(), account.newly_lost()) == ({}, {})
     account.enter(*entry(FRAME, 56), recorded=True)
-    assert account.newly_lost() == {}, "the camera may still report that it missed them"
+    assert account.newly_lost() == {}, "the camera may still report frames 54 and 55 as missed"
     reconcile(account, 57, missing=10)
     assert (account.newly_lost(), account.newly_lost()) == ({FRAME.key: 1}, {}), "one frame was lost on the bus"
 
@@ -217,13 +217,13 @@ def test_duplicates_neither_count_as_losses_nor_hide_them() -> None:
     account.revert()
     for published, lost in ((7, 1), (8, 1), (9, 2)):
         reconcile(account, published, "stopped")
-        assert account.lost() == {FRAME.key: lost}, "frame 3, and one more if nine frames were published"
+        assert account.lost() == {FRAME.key: lost}, "frame 3 is lost, and one more message if nine were published"
     assert account.recorded() == {FRAME.key: 7}
 
 
-def test_the_last_health_of_each_start_determines_its_losses() -> None:
+def test_the_last_health_of_each_start_determines_the_losses_of_that_start() -> None:
     account = LossAccount()
-    reconcile(account, 40, "running")  # messages before its first Health are not lost
+    reconcile(account, 40, "running")  # messages before the first Health do not count as lost
     reconcile(account, 90, "running")  # messages may still arrive
     assert account.lost() == {}
     reconcile(account, 100, "stopped")

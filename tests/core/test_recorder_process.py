@@ -1,4 +1,4 @@
-"""The recorder as a process: killed, stopped by signals or requests, refused without disk space."""
+"""The recorder as a process: killed, stopped by signals or requests, refused if disk space is short."""
 
 import json
 import os
@@ -29,7 +29,7 @@ from tests.support.loops import json_of, lowfc, refusal, start, until
 from tests.support.recording import PATIENCE_S, bodies_of
 
 SAFE_S = 0.6
-"""A kill -9 may lose only messages published in this time before it."""
+"""A kill -9 may lose only messages published less than this time before it."""
 
 
 class Bench:
@@ -148,12 +148,13 @@ def test_a_recording_is_stopped_without_a_controller_and_a_second_recorder_is_re
 
 @pytest.mark.usefixtures("own_runtime")
 def test_a_recorder_in_lockstep_requests_no_real_time_priority(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    set_up = Mock(side_effect=DataFileError("no further"))
+    set_up = Mock(side_effect=DataFileError("set up"))
     monkeypatch.setattr("lowfc.programs.core.recording.process.set_up_below_loop", set_up)
     for lockstep in ("true", "false"):
         (config := tmp_path / "lowfc.toml").write_text(f"lockstep = {lockstep}")
-        assert refusal("record", "--folder", tmp_path, "--run", new_run_id(), "--config", config) == "no further"
-    assert [call.args[0] for call in set_up.mock_calls] == [None, 10]
+        assert refusal("record", "--folder", tmp_path, "--run", new_run_id(), "--config", config) == "set up"
+    priorities = [call.args[0] for call in set_up.mock_calls]
+    assert priorities == [None, 10]
 
 
 @pytest.mark.parametrize(
@@ -210,7 +211,7 @@ def test_the_provenance_identifies_processor_and_blas() -> None:
     assert set(features) <= set(flags.partition(":")[2].split())
     assert {"sse2", "asimd"} & set(features)
     assert all(recorded[key] for key in ("host", "kernel", "processor", "python", "numpy", "eclipse-zenoh"))
-    assert any(digit.isdigit() for digit in recorded["blas"])
+    assert any(character.isdigit() for character in recorded["blas"])
     import scipy.linalg  # noqa: F401  # loads a BLAS of its own, which the loop does not use
 
     assert provenance() == {key: value for key, value in recorded.items() if key not in ("run", "seed")}

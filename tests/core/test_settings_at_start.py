@@ -10,7 +10,7 @@ from lowfc.control.loop.camera import CameraSettings
 from lowfc.programs.core.camera_reports import CameraReports
 
 
-def test_settings_at_the_start_of_a_lockstep_run_have_the_time_of_its_start() -> None:
+def test_settings_received_before_the_first_frame_of_a_lockstep_run_are_timed_at_the_start_of_the_run() -> None:
     """The camera publishes settings at its start and with its first frame; the query may return either."""
     clock, received = SimulatedClock(), list[CameraSettings]()
     state = wire.CameraState(timestamp=timestamp(clock.now_ns() + 10_000_000), rows=6, columns=7)

@@ -69,7 +69,7 @@ def test_a_linear_image_is_estimated_exactly(fits, optics, kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_fitted_nuisance_parameters_do_not_bias_the_modes(fits, optics, kind):
     I0, H = optics
-    nuisance = np.column_stack([I0, H[:, 0] * 1e6 + np.gradient(I0)])  # flux, and a shear that looks like the tilt
+    nuisance = np.column_stack([I0, H[:, 0] * 1e6 + np.gradient(I0)])  # flux, and a shear that resembles the first mode
     image_e = SCALE_E * (I0 + H @ [1.0, -2.0, 3.0] + nuisance @ [0.01, 2e-6])
     with_nuisance = fit(I0, H, SCALE_E, READ_NOISE_E, kind, nuisance)
     np.testing.assert_allclose(estimate(with_nuisance, image_e), [1.0, -2.0, 3.0], atol=1e-8)
@@ -85,7 +85,7 @@ def test_iterations_with_the_full_model_remove_the_second_order_error(fits, opti
 
     truth_nm = np.array([3.0, -2.0, 4.0])
     image_e = SCALE_E * model(truth_nm)
-    errors = [np.abs(each - truth_nm).max() for each in iterated(fits["weighted"], image_e, model, 60)]
+    errors = [np.abs(modes_nm - truth_nm).max() for modes_nm in iterated(fits["weighted"], image_e, model, 60)]
     assert errors[0] > 0.1
     assert all(after < 0.5 * before for before, after in pairwise(errors[:4]))
     assert errors[60] < 1e-9
@@ -115,7 +115,7 @@ def test_noise_is_the_sum_of_photon_noise_read_noise_and_rounding():
         assert part.var() == pytest.approx(variance, rel=0.04)
 
 
-def test_random_wavefronts_are_stratified_and_depend_on_the_seed():
+def test_random_wavefronts_are_stratified_and_depend_only_on_the_seed():
     drawn = random_wavefronts(np.random.default_rng(4), 50, NOLLS_20, 0.04, 0.016)
     bounds = bounds_waves(NOLLS_20, 0.04, 0.016)
     assert bounds.tolist() == [0.04] * 5 + [0.016] * 15
@@ -127,6 +127,7 @@ def test_random_wavefronts_are_stratified_and_depend_on_the_seed():
 
 @pytest.fixture(scope="module")
 def circle_modes():
+    """Modes (14, points) at the grid points within the unit circle, of unit rms."""
     u = 2.0 * pupil_axis(256)
     inside = u[:, None] ** 2 + u**2 <= 1.0
     return zernikes(NOLLS_14, u, u[:, None])[:, inside]
@@ -151,7 +152,7 @@ def test_expected_rms_agrees_with_many_draws(circle_modes):
     assert expected_rms(products, np.diag(bounds**2 / 3)) == pytest.approx(input_rms(products, bounds))
 
 
-def test_r_squared_is_one_minus_squared_errors_over_the_scatter_of_the_estimates():
+def test_r_squared_is_one_minus_the_ratio_of_squared_errors_to_the_scatter_of_the_estimates():
     truth = np.array([[0.0, 1.0], [2.0, 1.0], [4.0, 4.0]])
     estimates = truth + np.array([[0.0, 1.0], [0.0, 0.0], [0.0, -1.0]])
     # Sums of squares of the second mode: 2 of the errors 1, 0, -1, and 2 of the estimates 2, 1, 3 about their mean.

@@ -88,8 +88,8 @@ def test_prediction_of_a_candidate_agrees_with_the_full_chain(name, focal_light,
     expected = np.sum(contrast_form(Coronagraph(sensor.pupil), NOLLS_14, 550.0) * bound)
     assert contrast_noise(candidate.forms, central, "weighted") == pytest.approx(expected, rel=0.01)
     assert merit(candidate, Goal("contrast", "weighted")) == contrast_noise(candidate.forms, central, "weighted")
-    measured = {"zwfs_tuned": 9.0e-4, "clowfs_tuned": 1.4e-3}[name]  # by the second order, with the pseudo-inverse
-    assert candidate.nonlinearity_waves(14) == pytest.approx(measured, rel=0.2)
+    nonlinearity_waves = {"zwfs_tuned": 9.0e-4, "clowfs_tuned": 1.4e-3}[name]  # second order, with the pseudo-inverse
+    assert candidate.nonlinearity_waves(14) == pytest.approx(nonlinearity_waves, rel=0.2)
     assert predictions(candidate)["table3_waves"]["pinv"]["14"] > candidate.nonlinearity_waves(14)
 
 
@@ -101,8 +101,8 @@ def test_sweep_finds_the_minimum_between_its_values():
 
 
 def test_the_command_writes_the_configuration_keys_of_the_best_sensor(focal_light, tmp_path, monkeypatch):
-    pupils = {sensor_named("zwfs").pupil.tobytes(): focal_light}  # the light on the mask depends on the pupil only
-    monkeypatch.setattr(FocalLight, "of", lambda sensor: pupils[sensor.pupil.tobytes()])
+    by_pupil = {sensor_named("zwfs").pupil.tobytes(): focal_light}  # the light on the mask depends on the pupil only
+    monkeypatch.setattr(FocalLight, "of", lambda sensor: by_pupil[sensor.pupil.tobytes()])
     monkeypatch.setattr("lowfc.programs.design.full_light._POINTS", 3)
     out = tmp_path / "clowfs.toml"
     found = json_of("design", "clowfs", "--defocus", "3.2:4.2", "--out", out)

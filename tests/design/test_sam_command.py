@@ -53,6 +53,7 @@ def search_with(**options) -> Search:
 
 
 def run(search, folder, executor, chains=None, console=None, **files):
+    """Run or resume a search; return its result and the path of its layout file."""
     out = folder / "mask.json"
     chains = program.begin(search) if chains is None else chains
     console = Console(quiet=True) if console is None else console
@@ -138,7 +139,7 @@ with open_executor(2, None) as pool:
 """
 
 
-def test_a_worker_ends_with_a_search_that_is_killed(tmp_path):
+def test_a_worker_ends_when_its_search_is_killed(tmp_path):
     with (tmp_path / "worker").open("w") as output:
         assert subprocess.run([sys.executable, "-c", KILLED], stdout=output, check=False).returncode == -signal.SIGKILL
     worker = int((tmp_path / "worker").read_text())

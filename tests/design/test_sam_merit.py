@@ -31,7 +31,7 @@ RECORDED_TABLES = Path(__file__).parents[2] / "docs" / "measured" / "paper.json"
 
 @pytest.fixture(scope="module")
 def sensor():
-    """The full chain, with the sampling of Table 1."""
+    """The full chain, with the sampling of the paper's Table 1."""
     return sensor_named(LAYOUT)
 
 
@@ -69,7 +69,8 @@ def test_sum_over_holes_agrees_with_the_field_of_the_full_chain(sensor, modes, m
     three = Layout("three", "", ((0.2, -0.3, 0.07), (-0.414, 0.102, 0.12), (0.0, 0.05, 0.2)))
     fields = fields_of(build_optics(sensor.pupil), three.holes)
     u = pupil_axis(512)
-    # Fraction of each sample that a hole covers, linear in the sample's distance to the edge; the radii keep the area.
+    # Fraction of each sample that a hole covers, linear in the sample's distance to the edge.
+    # The radii are slightly reduced, so that the covered area is exactly that of the hole.
     radii = {d: np.sqrt(d**2 / 4 - 1 / (12 * 512**2)) for *_, d in three.holes}
     covered = [np.clip((radii[d] - np.hypot(u[:, None] - y, u - x)) * 512 + 0.5, 0, 1) for x, y, d in three.holes]
     for mask, allowed in ((sum(covered), 1e-6), (transmission(three, 512), 5e-3)):
@@ -180,7 +181,7 @@ def bounds(draw):
 
 
 def moved(orbits, at, orbit):
-    """The orbits after a move that removes the one at index `at` and adds `orbit`; either may be None."""
+    """The orbits after a move that removes the orbit at index `at` and adds `orbit`; either may be None."""
     remaining = [each for index, each in enumerate(orbits) if index != at]
     return remaining if orbit is None else [*remaining, orbit]
 

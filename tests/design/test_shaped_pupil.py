@@ -37,9 +37,10 @@ def designed(request):
 
 
 def field_of(quarter, samples_per, extent):
-    """Axis (lambda/D, half-integer offsets), and the field on it by the sensor's transform, relative to its peak.
+    """Axis, lambda/D, and the field on its grid by the sensor's transform, relative to the field's peak.
 
-    With 30 samples per lambda/D, no sample is a point at which the design is checked.
+    The samples are at half-integer multiples of their spacing. With `samples_per` = 30 per lambda/D, none of them is a
+    point at which the design is checked.
     """
     pupil = from_quarter(quarter, SAMPLES)
     axis = image_axis(2 * extent * samples_per, samples_per)
@@ -47,7 +48,7 @@ def field_of(quarter, samples_per, extent):
 
 
 def in_zone(request, axis, margin=0.0):
-    """Whether each point of the grid of an axis is in the dark zone, at least `margin` from its edge, lambda/D."""
+    """Whether each point of the grid of an axis is in the dark zone, at least `margin` (lambda/D) from its edge."""
     radius, angle = np.hypot(axis[:, None], axis), np.rad2deg(np.arctan2(np.abs(axis)[:, None], np.abs(axis)))
     return (
         (radius >= request.inner + margin)
@@ -76,12 +77,12 @@ def test_first_program_has_the_same_optimum_as_another_formulation_and_solver():
     request = replace(SMALL, limit=1.0)
     first = next(exchange(request))
     assert first.bound == pytest.approx(first.open_area, abs=1e-9)
-    axis, reach = np.arange(17) / 2, np.deg2rad(request.half_angle_deg)
+    axis, half_angle_rad = np.arange(17) / 2, np.deg2rad(request.half_angle_deg)
     row, column = np.nonzero(in_zone(request, axis, -1e-9))
-    polar = [(4.0, a) for a in np.linspace(0, reach, 7)] + [(8.0, a) for a in np.linspace(0, reach, 13)]
-    polar += [(r, reach) for r in np.linspace(4, 8, 9)]
-    x = np.concatenate([axis[column], [r * np.cos(a) for r, a in polar]])
-    y = np.concatenate([axis[row], [r * np.sin(a) for r, a in polar]])
+    edges = [(r, a) for r, count in ((4.0, 7), (8.0, 13)) for a in np.linspace(0, half_angle_rad, count)]
+    edges += [(r, half_angle_rad) for r in np.linspace(4, 8, 9)]
+    x = np.concatenate([axis[column], [r * np.cos(a) for r, a in edges]])
+    y = np.concatenate([axis[row], [r * np.sin(a) for r, a in edges]])
     u, samples = pupil_axis(32), np.arange(-7.5, 8.0) / SAMPLES
     v, h = (position[circle(32) > 0] for position in np.meshgrid(u, u, indexing="ij"))
     # Transform of one square cell of the pupil, from its samples.
@@ -177,7 +178,7 @@ def test_invalid_requests_are_refused(values, message):
         Request(**values)
 
 
-def test_too_few_rounds_give_advice(tmp_path):
+def test_too_few_rounds_are_an_error_and_leave_no_file(tmp_path):
     arguments = ["spc", "--outer", "8", "--cells", "16", "--rounds", "1", "--out", str(tmp_path / "spc.npz")]
     advice = refusal("design", *arguments, kind=ConfigurationError)
     assert "after 1 linear program with 16 cells the contrast is" in advice
