@@ -1,4 +1,4 @@
-"""Drivers as users write them: found by name, options validated, run by the camera and mirror loops."""
+"""Drivers as users write them: they are found by name, their options are validated, and loops run them."""
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -165,7 +165,7 @@ def test_a_driver_is_found_by_entry_point_or_by_module_and_class(
         ("own.name.py", "class Own: ...\n", "letters, digits and _, as in .*: rename the file"),
     ],
 )
-def test_a_driver_that_cannot_be_imported_gives_one_sentence(
+def test_a_driver_that_cannot_be_imported_gives_an_error_of_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, text: str, message: str
 ) -> None:
     monkeypatch.setattr(sys, "path", list(sys.path))
@@ -253,7 +253,7 @@ def test_doctor_shows_what_a_driver_found_as_text(monkeypatch: pytest.MonkeyPatc
     assert "requirements cannot be checked: TypeError" in [*device_checks(f"{__name__}:IdleMirror", CONFIG)][1].got
 
 
-def test_a_factory_without_a_name_is_a_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_factory_without_a_name_can_be_a_driver(monkeypatch: pytest.MonkeyPatch) -> None:
     factory = partial(Ramp)
     monkeypatch.setattr(plugins, "load", lambda kind, name: factory)
     assert [check.got for check in device_checks("basler", CONFIG)] == ["functools:partial"]
@@ -277,10 +277,10 @@ class UncheckedOptions(Ramp):
 
 
 class Incomplete:
-    """A driver without the required methods."""
+    """A driver without two of the required methods."""
 
     def expose(self) -> None:
-        """Nothing."""
+        """Return nothing."""
 
 
 @pytest.mark.parametrize(
@@ -297,12 +297,12 @@ class Incomplete:
         ),
     ],
 )
-def test_a_driver_that_cannot_be_opened_gives_one_sentence(name: str, message: str) -> None:
+def test_a_driver_that_cannot_be_opened_gives_an_error_of_one_sentence(name: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         plugins.opened("camera", name, CONFIG)
 
 
-def test_a_fault_in_the_first_settings_gives_one_sentence() -> None:
+def test_a_fault_in_the_first_settings_gives_an_error_of_one_sentence() -> None:
     camera = FailingSettings(FailingSettings.Options(), CONFIG)
     message = r"the camera cannot be started: RuntimeError: no link \(test_drivers.py, line \d+\)"
     # run_camera changes the scheduling class of its thread, which ends with the test
@@ -311,7 +311,7 @@ def test_a_fault_in_the_first_settings_gives_one_sentence() -> None:
     assert camera.closed
 
 
-def test_a_camera_that_cannot_be_started_gives_one_sentence_and_is_closed() -> None:
+def test_a_camera_that_cannot_be_started_gives_an_error_of_one_sentence_and_is_closed() -> None:
     camera = Ramp(Ramp.Options(), CONFIG)
     camera.start = lambda: 1 / 0
     loop = CameraLoop(camera, Listener(FakeClock()).service("camera"))
@@ -330,7 +330,7 @@ def test_a_camera_finishes_before_its_last_health_and_is_closed_after_it() -> No
     assert calls.count("finish") == 1
 
 
-def test_a_fault_in_an_optional_method_is_counted_and_reported_and_stops_nothing() -> None:
+def test_a_fault_in_an_optional_method_is_counted_and_reported_and_does_not_stop_the_camera() -> None:
     camera, listener = Ramp(Ramp.Options(), CONFIG), Listener(FakeClock(), FRAME)
     camera.sent = lambda _: 1 / 0
     camera.fill = lambda _: {}["temperature"]
@@ -367,10 +367,10 @@ def test_options_in_a_section_named_after_the_class_are_refused() -> None:
         plugins.opened("camera", f"{__name__}:Ramp", config)
 
 
-def test_camera_clock_is_converted_to_within_the_shortest_transfer_time() -> None:
+def test_times_of_the_cameras_clock_are_converted_within_0_3_ms() -> None:
     """The camera's clock is slow by 30 ppm, and the camera pauses for an hour.
 
-    A transfer takes 0.2 ms plus an exponential delay of mean 0.5 ms.
+    A transfer takes 0.2 ms, which the converter cannot know, plus an exponential delay of mean 0.5 ms.
     """
     clock, rng = CameraClock(), np.random.default_rng(1)
     errors_ns = []

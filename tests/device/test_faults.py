@@ -35,7 +35,7 @@ MS_NS = 1_000_000
 
 
 class UnprintableError(Exception):
-    """Exception whose text is no string."""
+    """Exception whose `__str__` returns no string."""
 
     def __str__(self) -> str:
         return 7
@@ -58,6 +58,7 @@ class Camera:
 
 
 def good(**fields: Any) -> Callable[[], Exposure]:
+    """Function that returns a valid exposure, except for these fields."""
     return lambda: Exposure(**{"pixels": GOOD} | fields)
 
 
@@ -98,7 +99,7 @@ def run_camera_loop(*exposures: Callable[[], Any], frames: int, settings: Camera
     ids=["raises", "exits", "text", "shape", "NaN", "future", "past", "NaN time", "loss", "huge loss", "str", "list"],
 )
 def test_camera_failures_are_reported_once_counted_and_retried(bad: Callable[[], Any], message: str) -> None:
-    recovered = [good()] * 251  # more than 1 s at 250 Hz
+    recovered = [good()] * 251  # more than 1 s at 250 Hz: then the driver counts as recovered
     listener = run_camera_loop(good(), bad, bad, bad, *recovered, frames=252)
     assert listener.events() == ["STARTED", "DRIVER_FAILED", "DRIVER_BACK", "STOPPED"]
     assert message in listener.event_texts("DRIVER_FAILED")[0]
@@ -112,7 +113,7 @@ def test_a_failing_camera_is_retried_after_increasing_pauses() -> None:
     bench.loop.run()
     pauses_s = 0 + 0.1 + 0.2 + 0.5 + 1 + 2 + 4 + 4 + 4  # after each of nine failures
     assert bench.clock.now_ns() - begun_ns == pytest.approx(pauses_s * 1e9, abs=0.1e9)
-    assert bench.listener.events().count("DRIVER_FAILED") == 2  # repeated after 10 s
+    assert bench.listener.events().count("DRIVER_FAILED") == 2  # reported again after 10 s
 
 
 def test_a_failing_camera_does_not_advance_simulated_time(tmp_path: Path) -> None:
@@ -131,7 +132,7 @@ def test_a_hanging_camera_is_reported_while_it_hangs() -> None:
     reported: list[bool] = []
 
     def hang() -> Exposure:
-        for _ in range(11):  # a check each 0.1 s: the first notes the call, ten reach the timeout of 1 s
+        for _ in range(11):  # every 0.1 s: the first check notes the call, the tenth after it reaches 1 s, the timeout
             bench.loop.watch.check()
             reported.append("DRIVER_HANGS" in bench.listener.events())
         return Exposure(GOOD)
@@ -168,7 +169,7 @@ def test_a_close_that_hangs_is_reported() -> None:
         ({"clock": "Realtime"}, "clock of the settings is 'Realtime', expected monotonic, realtime, run"),
     ],
 )
-def test_the_error_on_impossible_settings_names_them(setting: dict[str, Any], message: str) -> None:
+def test_the_error_on_an_impossible_setting_names_the_setting(setting: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         camera_state(replace(SETTINGS, **setting), 0)
 
@@ -194,7 +195,7 @@ def test_expose_may_return_none_and_settings_are_published_twice_a_second_meanwh
 
 
 def test_exposure_times_are_converted_from_the_clock_in_the_settings(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The host's monotonic clock is 5 s behind the run's clock, its wall clock 2 s."""
+    """The host's monotonic clock is 5 s behind the run's clock, and its wall clock is 2 s behind the run's clock."""
     monkeypatch.setattr(FakeClock, "offset_ns", 5 * 10**9)
     monkeypatch.setattr(FakeClock, "ahead_ns", lambda self: 2 * 10**9)
     start_ns = FakeClock().now_ns()
@@ -236,7 +237,7 @@ def test_lost_frames_without_numbers_are_counted() -> None:
     assert counts(run_camera_loop(good(), good(lost=3), good(), frames=3)) == [0, 4, 5]
 
 
-def test_restarted_frame_numbers_are_a_new_start_even_twice_in_a_second() -> None:
+def test_frame_numbers_that_restart_begin_a_new_start_of_the_camera_even_twice_in_a_second() -> None:
     listener = numbered(30_000, 30_001, 0, 1, 0, 1)
     starts = [start_of(sample.sequence) for sample in listener.samples[FRAME]]
     assert np.diff(starts).tolist() == [0, 1, 0, 1, 0]
@@ -259,7 +260,7 @@ def test_a_changed_region_is_published_before_its_first_frame() -> None:
 class Mirror:
     """Mirror whose next calls run the functions in `plan`; when `plan` is empty, it applies the command.
 
-    `heights_nm` has the largest actuator of each command.
+    `heights_nm` has the height of the highest actuator in each command.
     """
 
     def __init__(self) -> None:
@@ -384,7 +385,7 @@ def test_a_hanging_mirror_reports_no_position_and_goes_flat_before_the_next_comm
     bench.command(100.0)
 
     def hang(shape: Single) -> Single:
-        for _ in range(5):  # the first notes the call, five reach the timeout of 0.5 s
+        for _ in range(5):  # the first notes the call; the fifth check after it, below, reaches the timeout of 0.5 s
             bench.loop.watch.check()
         assert bench.listener.events() == ["STARTED"]
         bench.loop.watch.check()
@@ -437,7 +438,7 @@ def test_a_mirror_may_derive_from_the_class_of_optional_methods() -> None:
 
 
 @pytest.mark.parametrize("fault", [lambda: 1 / 0, lambda: np.full((4, 5), np.nan)], ids=["raises", "NaN"])
-def test_a_fault_in_the_shape_of_other_programs_is_a_failure_of_the_driver(fault: Callable[[], Any]) -> None:
+def test_a_fault_in_reading_the_shape_of_other_programs_is_a_failure_of_the_driver(fault: Callable[[], Any]) -> None:
     mirror = Mirror()
     mirror.beside = fault
     bench = MirrorBench(mirror)

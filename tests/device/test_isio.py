@@ -279,7 +279,7 @@ def test_a_mirror_whose_sum_is_always_late_counts_as_following(folder: Path, mon
     summing.join()
 
 
-def test_a_sum_that_is_absent_although_expected_counts_as_not_following(
+def test_a_mirror_whose_expected_sum_is_absent_counts_as_not_following(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(mirror_module, "SUM_SILENT_S", 0.01)
@@ -293,7 +293,7 @@ def test_a_sum_that_is_absent_although_expected_counts_as_not_following(
 
     driver, _ = mirror(total="dm99disp")
     check_failure_without_sum(driver, "dm99disp")
-    for total in (None, ""):  # the default name is read if it exists; an empty one is not read
+    for total in (None, ""):  # by default the sum is read if it exists; with an empty name none is read
         driver, _ = mirror(total=total)
         assert driver.apply(shape_nm(1)) is None
         time.sleep(0.02)

@@ -44,7 +44,7 @@ class Dying:
 """
 
 
-def test_a_restarted_camera_process_is_a_new_start(tmp_path: Path) -> None:
+def test_a_restarted_camera_process_publishes_frames_of_a_new_start(tmp_path: Path) -> None:
     (tmp_path / "dying.py").write_text(DYING)
     arguments = ("camera", "dying.py:Dying", "--run", "dying")
     starts: list[int] = []
@@ -135,22 +135,22 @@ class Bench:
         return self.events.count((process, event))
 
     def wait_until_settled(self) -> None:
-        """Wait for fifty frames in a row without a rejection and with small errors in closed loop."""
+        """Wait for 50 frames in a row in closed loop without a rejection or limit and with modal errors below 3 nm."""
         self.steps.clear()
 
-        def holds() -> bool:
+        def settled() -> bool:
             newest = self.steps[-50:]
             closed = all(step.mode == wire.LOOP_MODE_CLOSED and not step.reasons for step in newest)
             return len(newest) == 50 and closed and all(max(map(abs, step.error_nm)) < 3 for step in newest)
 
-        until(holds, 60)
+        until(settled, 60)
 
     def is_commanded(self, command_nm: list[float]) -> bool:
-        """Whether the last command is this one within 3 nm of noise in each mode."""
+        """Whether each mode of the last command is within 3 nm, the noise, of this command."""
         return bool(np.allclose(self.steps[-1].command_nm, command_nm, rtol=0, atol=3))
 
     def calls_nm(self) -> list[float]:
-        """Largest actuator of each command that the mirror's driver has received."""
+        """Largest magnitude of an actuator in each command that the mirror's driver has received."""
         return [float(line) for line in (self.folder / "calls").read_text().splitlines()]
 
 
@@ -199,8 +199,8 @@ def test_a_mirror_hang_of_five_seconds_blocks_commands_and_the_mirror_goes_flat_
         until(lambda: len(bench.calls_nm()) > len(before))
         assert time.monotonic() - begun_s > 4, "no command arrived while it hung"
         until(lambda: bench.count_of("mirror-dm", "DRIVER_BACK") and bench.count_of("controller", "MIRROR_BACK"))
-        repeated_nm, idle_nm = bench.calls_nm()[len(before) :][:2]
-        assert (repeated_nm, idle_nm) == (pytest.approx(before[-1], abs=1), 0), "the mirror's last shape, then flat"
+        repeated_nm, flat_nm = bench.calls_nm()[len(before) :][:2]
+        assert (repeated_nm, flat_nm) == (pytest.approx(before[-1], abs=1), 0), "the mirror's last shape, then flat"
         assert bench.count_of("mirror-dm", "DRIVER_HANGS") == bench.count_of("controller", "MIRROR_LOST") == 1
         bench.wait_until_settled()
 
@@ -235,7 +235,8 @@ def test_a_dead_mirror_process_is_reported_and_the_loop_holds_until_its_restart(
     with subprocess.Popen([*LOWFC, *MIRROR.split()[1:]], cwd=bench.folder) as process:
         try:
             bench.wait_until_settled()
-            time.sleep(1.2)  # after a fault, the controller returns to the command of two Health messages before
+            # After a fault, the controller returns to the command of two Healths before, which must be settled.
+            time.sleep(1.2)
             before_nm = list(bench.steps[-1].command_nm)
             bench.inject("mirror", "die")
             assert process.wait(10) == 7, "a failure: the units in deploy restart it"

@@ -81,7 +81,8 @@ def test_settings_default_to_the_configuration() -> None:
 class Buffers:
     """Stand-in for a stream of aravis: buffers of 2 x 3 pixels with the given frame numbers; 0 for a failed buffer.
 
-    At first, all but the last `later` are in the queue. By default it is empty: each arrives when the driver waits.
+    At first, the queue holds all but the last `later` buffers. By default it is empty: each buffer arrives when the
+    driver waits for it.
     """
 
     def __init__(self, *numbers: int, later: int = 99) -> None:
@@ -244,7 +245,7 @@ def test_an_aravis_camera_is_configured_and_incomplete_frames_count_as_lost(fake
 
 
 @contextmanager
-def _healths(run_id: str) -> Iterator[dict[str, wire.Health]]:
+def _newest_healths(run_id: str) -> Iterator[dict[str, wire.Health]]:
     """Newest Health of each process of a run, by name."""
     newest: dict[str, wire.Health] = {}
 
@@ -301,7 +302,7 @@ def test_a_closed_loop_counts_every_failed_buffer(emulated: None, tmp_path: Path
     (tmp_path / "bench.toml").write_text(FAST)
     arguments = "--run failing --config bench.toml"
     with (
-        _healths("failing") as health,
+        _newest_healths("failing") as health,
         in_background(tmp_path, f"lowfc controller {arguments}", f"lowfc mirror sim {arguments}"),
     ):
         until(lambda: {"controller", "mirror-dm"} <= set(health))
@@ -377,7 +378,7 @@ def _conforms(folder: Path, driver: str, options: str, rate_hz: float) -> None:
         f"[drivers.{plugins.section(driver)}]\nrows = 80\ncolumns = 80\n{options}"
     )
     arguments = "--run vendor --config bench.toml"
-    with _healths("vendor") as health, in_background(folder, f"lowfc camera {driver} {arguments}"):
+    with _newest_healths("vendor") as health, in_background(folder, f"lowfc camera {driver} {arguments}"):
         until(lambda: "camera" in health and health["camera"].state == "running")
         results = json.loads(command(folder, f"lowfc conformance camera {arguments} --json"))
     wrong = [check for check in results["checks"] if check["status"] == "wrong"]

@@ -39,7 +39,7 @@ PROGRAMS = re.findall(r"^```python\n(.*?)^```$", DOCUMENT.read_text(), flags=re.
 
 @dataclass
 class Night:
-    """A running loop, the requests sent to it, and their results."""
+    """A running loop, the outputs of commands and programs, and, after `end`, the loop's results and logs."""
 
     folder: Path
     process: "Popen[str]"
@@ -50,7 +50,7 @@ class Night:
 
     def ctl(self, command: str) -> str:
         _, *arguments = [
-            str(self.folder / one) if (self.folder / one).is_file() else one for one in shlex.split(command)
+            str(self.folder / part) if (self.folder / part).is_file() else part for part in shlex.split(command)
         ]
         done = lowfc(*arguments, "--run", self.name)
         assert done.exit_code == 0, (done.output, done.exception)
@@ -151,7 +151,7 @@ def _make_requests_beyond_the_document(night: Night) -> None:
         night.outputs["while paused"] = night.ctl("lowfc ctl status --json")
         loop.close_loop()
         loop.record(False)
-        night.outputs["while stopped"] = night.ctl("lowfc ctl status --json")
+        night.outputs["while not recording"] = night.ctl("lowfc ctl status --json")
         loop.record(True)
         until(lambda: loop.processes()["controller"].mode == wire.LOOP_MODE_CLOSED)
         until(lambda: not loop.processes()["recorder"].recording.stopped)
@@ -172,7 +172,7 @@ def _make_requests_beyond_the_document(night: Night) -> None:
 
 def test_every_request_is_made_by_a_command_of_the_document() -> None:
     names = {command.split()[2] for command in COMMANDS} - {"bench"}  # `bench` makes no request
-    assert names == {one.example.split()[0] for one in DECLARED if one.example}
+    assert names == {request.example.split()[0] for request in DECLARED if request.example}
 
 
 def test_the_commands_print_what_they_did(night: Night) -> None:
@@ -202,14 +202,14 @@ def test_the_commands_print_what_they_did(night: Night) -> None:
     status = json.loads(outputs["lowfc ctl status --json"])
     assert (status["mode"], status["law"]["name"], status["offset_rms_nm"]) == ("closed", "integrator", 0.0)
     assert (status["run"], status["paused"], status["recording"]) == (night.name, False, "recording")
-    paused, stopped = json.loads(outputs["while paused"]), json.loads(outputs["while stopped"])
-    assert (paused["mode"], paused["paused"], stopped["recording"]) == ("open", True, "stopped")
+    paused, not_recording = json.loads(outputs["while paused"]), json.loads(outputs["while not recording"])
+    assert (paused["mode"], paused["paused"], not_recording["recording"]) == ("open", True, "stopped")
     (listed,) = json.loads(outputs["runs"])["runs"]
     expected = {"run": night.name, "mode": "closed", "holding": None, "recording": "recording"}
     assert {name: listed[name] for name in expected} == expected
     assert listed.keys() == {"run", "mode", "holding", "rate_hz", "uptime_s", "processes", "recording", "log"}
     names = ["camera", "controller", "mirror-dm", "recorder"]
-    assert [one["process"] for one in listed["processes"]] == names
+    assert [process["process"] for process in listed["processes"]] == names
     assert all(name in outputs["hosts"] for name in names)
     assert outputs["hosts"].endswith("no clock is compared: the run has no router, or its router reports no clock\n")
     assert f"run {night.name}" in outputs["short name"]
@@ -263,7 +263,7 @@ def test_every_command_keeps_the_actuator_limits(night: Night) -> None:
             assert violations(limits, before, now) == []
 
 
-def test_the_night_is_replayed_to_the_bit(night: Night) -> None:
+def test_the_night_is_replayed_bit_for_bit(night: Night) -> None:
     commands = 0
     for log in night.logs:
         results = json_of("replay", log)
@@ -278,11 +278,11 @@ def test_the_night_is_replayed_to_the_bit(night: Night) -> None:
 
 
 @pytest.mark.slow
-def test_requests_are_answered_while_a_process_is_stopped_beyond_the_timeout_of_its_links(tmp_path: Path) -> None:
+def test_requests_are_answered_while_a_process_is_suspended_beyond_the_timeout_of_its_links(tmp_path: Path) -> None:
     """A link that has timed out is closed without blocking the controller's receiving thread (formerly for 10 s)."""
-    with started(tmp_path, "sim-loop", "--run", "stopped", "--rate", "50", "--no-record") as process:
-        until(lambda: "sim_dm" in children(process.pid) and "stopped" in running())
-        with Client("stopped") as loop:
+    with started(tmp_path, "sim-loop", "--run", "suspended", "--rate", "50", "--no-record") as process:
+        until(lambda: "sim_dm" in children(process.pid) and "suspended" in running())
+        with Client("suspended") as loop:
             until(lambda: loop.status().state.frames_used)  # type: ignore[union-attr]
             mirror = children(process.pid)["sim_dm"]
             os.kill(mirror, signal.SIGSTOP)
