@@ -108,7 +108,7 @@ def test_systemd_accepts_the_units(units: Path) -> None:
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
     common = units / COMMON
     common.write_text(common.read_text().replace("ProtectSystem=", "ProtectSystme="))
-    assert "ProtectSystme" in analyze(units, *verify, *names).stderr, "the check misses a typing error"
+    assert "ProtectSystme" in analyze(units, *verify, *names).stderr, "a misspelt key is reported"
 
 
 @needs_systemd
@@ -263,9 +263,8 @@ class Manager:
         return self.notifications.count("WATCHDOG=1")
 
     def status(self) -> str:
-        return next(
-            (one.removeprefix("STATUS=") for one in reversed(self.notifications) if one.startswith("STATUS=")), ""
-        )
+        statuses = [line.removeprefix("STATUS=") for line in self.notifications if line.startswith("STATUS=")]
+        return statuses[-1] if statuses else ""
 
 
 WATCHDOG_S = 0.2
@@ -312,11 +311,11 @@ def test_processes_notify_systemd_that_they_are_ready_alive_and_stopping(tmp_pat
     with contextlib.ExitStack() as stack:
         names = ("recorder", "sim-mirror", "controller", "sim-camera")
         processes = {name: stack.enter_context(contextlib.closing(Supervised(name, tmp_path))) for name in names}
-        for one in processes.values():
-            until(lambda one=one: "READY=1" in one.manager.notifications and one.manager.beats > 5)
-            # One per half of the timeout, as systemd advises; two more are tolerated.
-            most_beats = (time.monotonic() - one.manager.begun_s) / (WATCHDOG_S / 2) + 2
-            assert one.manager.beats <= most_beats, f"{one.name} sends WATCHDOG=1 too often"
+        for child in processes.values():
+            until(lambda child=child: "READY=1" in child.manager.notifications and child.manager.beats > 5)
+            # One WATCHDOG=1 per half of the timeout, as systemd advises; two more are tolerated.
+            most_beats = (time.monotonic() - child.manager.begun_s) / (WATCHDOG_S / 2) + 2
+            assert child.manager.beats <= most_beats, f"{child.name} sends WATCHDOG=1 too often"
         controller, mirror = processes["controller"], processes["sim-mirror"]
         until(lambda: re.fullmatch(r"running, open, \d+ Hz", controller.manager.status()))
 
@@ -338,20 +337,21 @@ def test_processes_notify_systemd_that_they_are_ready_alive_and_stopping(tmp_pat
         controller.process.send_signal(signal.SIGABRT)  # as systemd does when the watchdog expires
         assert controller.process.wait(20) == -signal.SIGABRT
         assert "advance_or_hang" in controller.stderr_file.read_text()  # the journal shows where it hung
-        remaining = [one for one in processes.values() if one is not controller]
-        for one in remaining:
-            assert "STOPPING=1" not in one.manager.notifications
-            one.process.send_signal(signal.SIGTERM)
+        remaining = [child for child in processes.values() if child is not controller]
+        for child in remaining:
+            assert "STOPPING=1" not in child.manager.notifications
+            child.process.send_signal(signal.SIGTERM)
         # A list, so that each round reads every queue: a full one would drop the last notifications.
         until(
             lambda: (
                 False not in [bool(one.manager.notifications) and one.process.poll() is not None for one in remaining]
             )
         )
-        for one in remaining:
-            assert one.process.returncode == 0, one.stderr_file.read_text()
-            assert one.manager.notifications.count("READY=1") == one.manager.notifications.count("STOPPING=1") == 1
-            assert one.manager.status().startswith("stopped")
+        for child in remaining:
+            assert child.process.returncode == 0, child.stderr_file.read_text()
+            notifications = child.manager.notifications
+            assert notifications.count("READY=1") == notifications.count("STOPPING=1") == 1
+            assert child.manager.status().startswith("stopped")
 
 
 def test_a_watchdog_of_another_process_and_a_missing_service_manager_are_ignored(tmp_path: Path) -> None:
@@ -372,7 +372,7 @@ def test_the_loop_does_not_wait_for_a_service_manager_that_does_not_read() -> No
         manager.bind("")  # an abstract socket, as systemd may use
         name = manager.getsockname().decode().replace("\0", "@", 1)
         supervisor = Supervisor({"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "2"})
-        for count in range(2000):  # more than the socket's queue
+        for count in range(2000):  # more than the socket's queue holds
             supervisor.alive(count * 1000)
         assert manager.recv(4096) == b"WATCHDOG=1"
 

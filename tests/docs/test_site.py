@@ -45,7 +45,7 @@ def test_the_site_has_every_page_and_every_declared_name(
 ) -> None:
     """Broken links and pages outside an index are warnings, and a warning fails the build.
 
-    Only the complete site includes docstrings, all measured values, typographic quotes, and the index of the search.
+    Only the complete site includes docstrings, all measured values, typographic quotes, and the search index.
     """
     from sphinx.application import Sphinx
     from sphinx.builders.html import StandaloneHTMLBuilder

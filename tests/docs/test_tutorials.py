@@ -54,7 +54,7 @@ def test_the_first_loop_tutorial_runs_as_written(tmp_path: Path, shorter: bool, 
     if shorter:
         request.getfixturevalue("without_drawings")
     page = (PAGES / "first_loop.md").read_text()
-    assert page.index("install -e '.[plots]'") < page.index("lowfc report last"), "the extra comes before its use"
+    assert page.index("install -e '.[plots]'") < page.index("lowfc report last"), "`plots` is installed before its use"
     first, info, report, replay, what_if, digest = page_outputs(tmp_path, "first_loop", shorter=shorter).values()
     assert "frame to command" in first
     assert "lowfc/camera/frame" in info
@@ -77,19 +77,19 @@ def test_the_design_mask_tutorial_runs_as_written(tmp_path: Path) -> None:
     design, *loops = page_outputs(tmp_path, "design_mask").values()
     assert "written to mask.json" in design
     assert len(loops) == 3
-    assert all("frame to command" in one for one in loops)
+    assert all("frame to command" in output for output in loops)
 
 
 @pytest.mark.usefixtures("without_drawings")  # `test_golden` tests the drawings of this log
 def test_the_bad_night_tutorial_runs_as_written(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "tests" / "golden", tmp_path / "tests" / "golden")
-    info, report, replay, killed, recovered, recovered_info = page_outputs(tmp_path, "bad_night").values()
+    info, report, replay, killed_info, recovered, recovered_info = page_outputs(tmp_path, "bad_night").values()
     assert "FRAMES_REFUSED 6, NO_FRAMES 3" in info
     assert report.startswith("Not a good run: ")
     assert (tmp_path / "night.html").is_file()
     assert "163 frames" in replay
     assert "rule changed" in replay
-    assert "completes it" in killed
+    assert "completes it" in killed_info
     assert "whole.mcap" in recovered
     assert re.search(r"^state +complete$", recovered_info, re.MULTILINE)
 

@@ -32,7 +32,7 @@ disable_cpu_idle = false
 @pytest.mark.slow
 def test_an_interrupted_calibration_of_a_running_loop_is_resumed(tmp_path: Path) -> None:
     (tmp_path / "test.toml").write_text(CONFIG)
-    options = ("--config", "test.toml", "--no-record", "--open", "--lockstep")  # independent of the host's load
+    options = ("--config", "test.toml", "--no-record", "--open", "--lockstep")  # lockstep: independent of the load
     loop = start(tmp_path, "sim-loop", *options)
     try:
         until(running)
@@ -42,7 +42,7 @@ def test_an_interrupted_calibration_of_a_running_loop_is_resumed(tmp_path: Path)
         assert calibrating.returncode == 130
         assert "kept in night.fits.part.npz: " in stderr
         with Client() as client:
-            until(lambda: flat(client))
+            until(lambda: is_flat(client))
         done = run(tmp_path, "calibrate", "--cycles", "5", "--resume", "--out", "night.fits", "--json")
         assert done.returncode == 0, done.stderr
         assert "continuing after" in done.stderr
@@ -54,7 +54,7 @@ def test_an_interrupted_calibration_of_a_running_loop_is_resumed(tmp_path: Path)
         assert not (tmp_path / "night.fits.part.npz").exists()
         calibration = calibration_file.load(tmp_path / "night.fits")
         with Client() as client:
-            assert flat(client)
+            assert is_flat(client)
             matrix = cross_talk(calibration.reconstructor, client.calibration().response)
             assert np.abs(matrix).max() == np.float64(results["cross_talk"])
             client.load(calibration)
@@ -67,7 +67,7 @@ def test_an_interrupted_calibration_of_a_running_loop_is_resumed(tmp_path: Path)
         interrupt(loop)
 
 
-def flat(client: Client) -> bool:
+def is_flat(client: Client) -> bool:
     """Whether the command is zero."""
     state = client.status().state
     return not np.frombuffer(state.actuators, np.float32).any()
@@ -93,7 +93,7 @@ lowest_hz = 1.5
 def test_the_rejection_measured_on_a_running_loop_and_from_its_log_is_the_same(tmp_path: Path) -> None:
     (tmp_path / "loop.toml").write_text(REJECTION_CONFIG)
     options = ("--duration", "4", "--lines", "8", "--json", "--plot", "live.png")
-    loop = start(tmp_path, "sim-loop", "--config", "loop.toml", "--lockstep")  # independent of the host's load
+    loop = start(tmp_path, "sim-loop", "--config", "loop.toml", "--lockstep")  # lockstep: independent of the load
     try:
         until(lambda: recorded_bytes(tmp_path) > 4_000_000)
         done = run(tmp_path, "acceptance", "rejection", *options)

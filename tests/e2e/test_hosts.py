@@ -43,7 +43,7 @@ certificates = "CERTIFICATES"
 SHIFTS_NS = {"camera": 37_000_000, "controller": -250_000_000, "mirror": 3_000_000_000, "desk": -1_000_000}
 """Offset of each host's clock."""
 HOST_OF = {"camera": "camera", "controller": "controller", "mirror-dm": "mirror", "recorder": "desk"}
-"""Host of each process."""
+"""Host of each process, except the router."""
 SUPPORT = Path(__file__).parents[1] / "support"
 ROLES = roles(["mirror-dm"])
 
@@ -117,12 +117,12 @@ class Bench:
             time.sleep(0.05)
 
     def wait_until_settled(self, timeout_s: float = 40) -> None:
-        """Wait for more than 20 consecutive good frames and mirror states, received from now on."""
+        """Wait for more than 30 new steps and as many new mirror states, of which more than the last 20 are good."""
         start = len(self.reports())
 
         def good() -> bool:
             new = self.reports()[start:]
-            received = all(sum(one[what] for one in new) > 30 for what in ("steps", "states"))
+            received = all(sum(report[what] for report in new) > 30 for what in ("steps", "states"))
             return received and new[-1]["good"] > 20 and new[-1]["following"] > 20
 
         self.wait(good, "closed loop", timeout_s)
@@ -198,7 +198,7 @@ def test_a_log_of_several_hosts_states_the_clock_error_of_its_latencies(bench: B
     results = json.loads(done.stdout)
     bound_us = results["host"]["clock_error_us"]
     assert bound_us > 0
-    # By the hosts' own clocks, frames would arrive 287 ms before they are sent, and the mirror would move 3 s too late.
+    # By the hosts' own clocks, frames would arrive 287 ms before they are sent, and the mirror would move 3 s late.
     for span in ("frame_to_command", "frame_to_mirror", "command_to_mirror"):
         assert -bound_us < results["latency_us"][span]["p50"] < 100_000
     text = desk.run("-m", "lowfc", "latency", str(log), timeout_s=90)
@@ -214,10 +214,10 @@ def test_without_the_cameras_link_the_command_is_held_and_repeated(bench: Bench)
         bench.wait(lambda: len(bench.reports()) > start + 15, "output of a second and a half")
         during = bench.reports()[start + 5 :]
         # the controller repeats the held command, so that it does not expire at the mirror
-        assert all(one["steps"] == 0 for one in during)
-        assert all(one["status"] == "MIRROR_STATUS_FOLLOWING" for one in during)
-        held = {round(one["highest_nm"], 3) for one in during}
-        assert len(held) == 1, held
+        assert all(report["steps"] == 0 for report in during)
+        assert all(report["status"] == "MIRROR_STATUS_FOLLOWING" for report in during)
+        heights_nm = {round(report["highest_nm"], 3) for report in during}
+        assert len(heights_nm) == 1, heights_nm
     bench.wait_until_settled()
     assert bench.events("controller FRAMES_BACK") > 0
 
@@ -230,7 +230,7 @@ def test_without_the_mirrors_link_its_command_timeout_acts(bench: Bench) -> None
         assert "relaxing to flat" in mirror.stderr("mirror-dm")
         start = len(bench.reports())
         bench.wait(lambda: len(bench.reports()) > start + 10, "output of a second")
-        assert sum(one["states"] for one in bench.reports()[start + 5 :]) == 0
+        assert sum(report["states"] for report in bench.reports()[start + 5 :]) == 0
     bench.wait_until_settled()
 
 
@@ -253,8 +253,8 @@ def test_without_the_desks_link_the_loop_continues(bench: Bench) -> None:
         bench.wait(lambda: len(bench.reports()) > start + 40, "output of four seconds")
         assert [bench.events(name) for name in events] == before
         during = bench.reports()[start:]
-        assert sum(one["steps"] for one in during) > 0.8 * 4 * bench.rate_hz
-        assert sum("FOLLOWING" in one["status"] for one in during) > 0.9 * len(during)
+        assert sum(report["steps"] for report in during) > 0.8 * 4 * bench.rate_hz
+        assert sum("FOLLOWING" in report["status"] for report in during) > 0.9 * len(during)
     bench.wait(lambda: bench.events("recorder MESSAGES_LOST") > lost, "report of the recorder's losses")
     bench.wait_until_settled()
 
@@ -328,7 +328,7 @@ def test_a_forged_command_with_the_controllers_certificate_reaches_the_mirror(be
     bench.wait(
         lambda: (
             bench.events("mirror-dm COMMAND_REFUSED") > before
-            or any(one["highest_nm"] > 90 for one in bench.reports()[-30:])
+            or any(report["highest_nm"] > 90 for report in bench.reports()[-30:])
         ),
         "forged command at the mirror",
     )

@@ -79,7 +79,7 @@ def test_the_tilt_residual_agrees_with_the_prediction(tmp_path: Path, frames: in
 
 
 @pytest.mark.slow
-def test_a_lockstep_run_ends_and_names_a_stopped_process(tmp_path: Path) -> None:
+def test_a_lockstep_run_ends_and_names_a_suspended_process(tmp_path: Path) -> None:
     """Five seconds of real time without progress end a lockstep run."""
     process = start(tmp_path, "sim-loop", "--lockstep", "--duration", "600")
     until(lambda: recorded_bytes(tmp_path) > 4e6)

@@ -96,7 +96,7 @@ def conformance(folder: Path, *commands: str) -> None:
         assert f"--run {results['run']}" in line
         assert results["device"] in line or results["device"] == "mirror-dm"
         assert results["counts"]["wrong"] == 0
-        assert {"clear", "relaxing"}.isdisjoint(one["name"] for one in results["checks"] if one["status"] != "ok")
+        assert {"clear", "relaxing"}.isdisjoint(check["name"] for check in results["checks"] if check["status"] != "ok")
         assert results["counts"]["ok"] >= len(results["checks"]) - 5  # a busy host causes warnings
 
 
@@ -110,7 +110,7 @@ def test_the_loop_closes_with_a_users_camera_and_mirror(folder: Path) -> None:
             errors_nm.append(list(wire.ControlStep.FromString(sample.payload).error_nm))
 
         def rms_nm() -> float:
-            """Norm of the mean error of the last 100 steps: the residual without noise; NaN before 100 steps."""
+            """Norm of the mean error of the last 100 steps: the residual without noise; NaN if any step has no error."""
             measured = [error for error in errors_nm[-100:] if error]
             return float(np.linalg.norm(np.mean(measured, axis=0))) if len(measured) == 100 else np.nan
 

@@ -19,20 +19,20 @@ pytestmark = [pytest.mark.browser, needs_chromium]
 
 # What a screenshot does not show: bounding boxes, images inside drawings, the height of the whole page.
 MEASURE = """(async () => {
-  const box = (one) => { const r = one.getBoundingClientRect(); return [r.left, r.top, r.width, r.height]; };
-  const images = [...document.querySelectorAll("image, img")].map(async (one) => {
+  const box = (element) => { const r = element.getBoundingClientRect(); return [r.left, r.top, r.width, r.height]; };
+  const images = [...document.querySelectorAll("image, img")].map(async (element) => {
     const copy = new Image();
-    copy.src = one.href?.baseVal ?? one.src;
+    copy.src = element.href?.baseVal ?? element.src;
     try { await copy.decode(); } catch { return 0; }
-    return copy.naturalWidth * copy.naturalHeight * one.getBoundingClientRect().width;
+    return copy.naturalWidth * copy.naturalHeight * element.getBoundingClientRect().width;
   });
-  document.querySelectorAll("details").forEach((one) => { one.open = true; });
+  document.querySelectorAll("details").forEach((element) => { element.open = true; });
   const text = document.body.innerText;
-  document.querySelectorAll("details").forEach((one) => { one.open = false; });
+  document.querySelectorAll("details").forEach((element) => { element.open = false; });
   return {
     text: text.replace(/\\s+/g, " "),
     pictures: Object.fromEntries([...document.querySelectorAll("figure > svg")].map(
-      (one) => [one.getAttribute("aria-label"), box(one)])),
+      (element) => [element.getAttribute("aria-label"), box(element)])),
     images: await Promise.all(images),
     overflow: document.documentElement.scrollWidth - document.documentElement.clientWidth,
     height: document.documentElement.scrollHeight,
@@ -98,8 +98,8 @@ def test_the_text_contains_the_values_of_the_json(measurements: dict[str, Any], 
     expected += [f"{stage['p99']:.1f}" for stage in results["timing"]["latency_us"].values()]
     expected += [term[key] for term in budget["terms"] for key in ("name", "how")]
     expected.append(f"{budget['true_residual']['rms_nm']['all modes']:.3f}")
-    expected.append("rate_hz = 250.0")  # from the configuration, which the page folds
-    assert [one for one in expected if one not in text] == []
+    expected.append("rate_hz = 250.0")  # from the configuration, which the page shows folded
+    assert [part for part in expected if part not in text] == []
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -124,7 +124,7 @@ def test_the_pictures_are_visible_in_light_and_dark_mode(
         assert drawn.any(axis=1).mean() > 0.5, f"{name} is empty over half of its height"
         assert drawn.any(axis=0).mean() > 0.5, f"{name} is empty over half of its width"
         assert region.std() > 5, name
-    assert np.ptp(shown[::3, ::3], axis=2).max() > 80, "there is no colour in it"
+    assert np.ptp(shown[::3, ::3], axis=2).max() > 80, "the pictures have colours"
 
 
 def test_the_checks_detect_a_broken_page(folder: Path, page: Page) -> None:

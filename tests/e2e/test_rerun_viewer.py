@@ -24,7 +24,7 @@ from tests.support.report_log import SyntheticLog
 from tests.support.viewers import complaints, listening, on_screen, pixels, share_of
 
 ORANGE, BLUE = (214, 110, 20), (20, 90, 214)
-MIN_SHARE = 0.05  # least fraction of the viewer's pixels that have one of the two colours
+MIN_SHARE = 0.05  # least fraction of the viewer's pixels that have each of the two colours
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_an_image_that_was_logged_is_on_the_screen(headless: RerunViewer, tmp_pa
     shown = pixels(picture)
     assert shown.shape == (400, 640, 3)
     assert min(share_of(shown, colour) for colour in (ORANGE, BLUE)) > MIN_SHARE
-    assert _mean_row(shown, ORANGE) < _mean_row(shown, BLUE), "it is upside down"
+    assert _mean_row(shown, ORANGE) < _mean_row(shown, BLUE), "orange is above blue"
     assert [view.origin for view in headless.state().views] == ["/image"]
     assert complaints(headless) == []
     stream.disconnect()
@@ -114,7 +114,7 @@ def test_a_new_viewer_on_the_same_port_receives_a_new_stream(web: RerunViewer) -
     old_stream.disconnect()
 
 
-def test_a_stopped_viewer_dies_with_its_parent() -> None:
+def test_a_suspended_viewer_dies_with_its_parent() -> None:
     program = (
         "import os, signal\nfrom lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show\n"
         "viewer = RerunViewer(Show.WEB)\nprint(viewer.pid, flush=True)\n"
@@ -170,7 +170,7 @@ def _send_two_colours(viewer: RerunViewer) -> rr.RecordingStream:
 
 
 def _mean_row(shown: Any, colour: tuple[int, int, int]) -> float:
-    """Mean row of the pixels with a colour, up to 12 of 255 in each channel."""
+    """Mean row of the pixels that are within 12 of 255 of a colour in each channel."""
     return float(np.nonzero(np.all(np.abs(shown.astype(int) - colour) <= 12, axis=2))[0].mean())
 
 
@@ -188,7 +188,7 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def read_by_rerun(log: Path, column: str) -> dict[str, list[Any]]:
-    """Values of a component by topic, as rerun reads a log without code of lowfc."""
+    """Values of the columns that match a pattern, by topic, as rerun reads a log without code of lowfc."""
     found: dict[str, list[Any]] = defaultdict(list)
     for chunk in McapReader(log).stream():
         batch = chunk.to_record_batch()
@@ -203,9 +203,9 @@ def test_rerun_reads_images_as_images(night: Path) -> None:
     for key, kind in (("/lowfc/camera/frame", "<u2"), ("/lowfc/mirror/dm/surface", "<f4")):
         sent = [RawImage.FromString(payload) for payload in payloads(night)[key]]
         assert len(sent) == len(buffers[key]) > 0
-        assert [(one["width"], one["height"]) for one in formats[key]] == [(one.width, one.height) for one in sent]
-        for buffer, one in zip(buffers[key], sent, strict=True):
-            np.testing.assert_array_equal(np.array(buffer, np.uint8).view(kind), np.frombuffer(one.data, kind))
+        assert [(read["width"], read["height"]) for read in formats[key]] == [(raw.width, raw.height) for raw in sent]
+        for buffer, raw in zip(buffers[key], sent, strict=True):
+            np.testing.assert_array_equal(np.array(buffer, np.uint8).view(kind), np.frombuffer(raw.data, kind))
 
 
 def test_rerun_reads_our_own_messages_with_their_values(night: Path) -> None:
@@ -214,6 +214,6 @@ def test_rerun_reads_our_own_messages_with_their_values(night: Path) -> None:
     assert read.keys() == own
     assert len(own) >= 8
     truths = [wire.Truth.FromString(payload).residual_rms_nm for payload in sent["/lowfc/sim/truth"]]
-    assert [one["residual_rms_nm"] for one in read["/lowfc/sim/truth"]] == truths
+    assert [truth["residual_rms_nm"] for truth in read["/lowfc/sim/truth"]] == truths
     steps = [wire.ControlStep.FromString(payload).error_nm for payload in sent["/lowfc/control/step"]]
-    assert [one["error_nm"] for one in read["/lowfc/control/step"]] == [list(step) for step in steps]
+    assert [step["error_nm"] for step in read["/lowfc/control/step"]] == [list(step) for step in steps]

@@ -34,7 +34,7 @@ from tests.support.loops import FIXED, LOWFC, children, interrupt, run, start, u
 from tests.support.report_log import SyntheticLog
 from tests.support.viewers import browser_screenshot, complaints, needs_chromium, on_screen, pixels, share_of, views
 
-MIN_SHADES = 8  # colours in a panel with content, below its title; an empty one has its background only
+MIN_SHADES = 8  # least number of colours below the title of a panel with content; an empty panel has one
 TITLE_ROWS = 30
 
 
