@@ -1,8 +1,8 @@
 """Write the golden files of the current version: `python -m tests.golden.make FOLDER`.
 
 A short loop on an in-memory bus, with a camera that exposes on request and a clock that is advanced explicitly. Its log
-has every kind of input that release 0.1 knew, but no mirror reports, bench values, leases or permits. The files of a
-released version are never changed.
+has every kind of input that release 0.1 knew; reports of a mirror's faults, bench values, leases and permits are newer
+and absent. The files of a released version are never changed.
 """
 
 import shutil
@@ -96,7 +96,7 @@ class Night(ThreadedRun):
         self.shape_nm = actuators(wire.MirrorState.FromString(sample.payload))
 
     def expose(self, frames: int, change: Callable[[Any], Any] = lambda pixels: pixels, late_ns: int = 0) -> None:
-        """Expose frames, each after the step of the one before; `change` modifies pixels, `late_ns` delays arrival."""
+        """Expose frames, each after the step of the previous one; `change` alters pixels, `late_ns` delays arrival."""
         for _ in range(frames):
             pixels = self.scene.expose(self.index, self.shape_nm)
             truth = self.scene.truth(self.index, self.shape_nm).sampled
@@ -182,7 +182,7 @@ def main(folder: Path) -> None:
     loop.stop()
     loop.channel("dark-hole")
     loop.offset()
-    night.frames.put(b"", sequence=night.last_step + 2)  # unreadable; the one before it is missing
+    night.frames.put(b"", sequence=night.last_step + 2)  # unreadable; the frame before it is missing
     night.expose(1, lambda pixels: pixels[:3])  # of the wrong size
     night.expose(1, lambda pixels: np.full_like(pixels, 100))  # dark
     night.expose(1, lambda pixels: np.full_like(pixels, 65_535))  # saturated

@@ -21,13 +21,13 @@ UNIT = re.compile(
     r"radii|(their|any) unit|without unit|variance|sequence|"
     r"fractions?|factors?|relative|transmissions?|weights|amplitudes?|indices|contrast|0 or 1|1 where|whether)\b"
 )
-"""A word for a unit; the s of a possessive does not count as seconds."""
+"""A word for a unit, or for a quantity without unit; the s of a possessive does not count as seconds."""
 
 Definition = ast.FunctionDef | ast.ClassDef
 
 
 def public(body: list[ast.stmt], parent: str, parents_text: str = "") -> Iterator[tuple[str, Definition, str, str]]:
-    """Name, node, own docstring and docstring of the class of each public definition."""
+    """Name, node and docstring of each public definition, and the docstring of its class."""
     for node in body:
         if isinstance(node, Definition) and not node.name.startswith("_"):
             text = ast.get_docstring(node) or ""
@@ -64,7 +64,7 @@ def test_docstrings_are_valid_markup(package: str) -> None:
     for name, _, text, _ in definitions(package):
         document = new_document(name, settings)
         Parser().parse(str(GoogleDocstring(text, Config(napoleon_use_ivar=True))), document)
-        assert [each.astext() for each in document.findall(docutils.nodes.substitution_reference)] == [], name
+        assert [node.astext() for node in document.findall(docutils.nodes.substitution_reference)] == [], name
     assert settings.warning_stream.getvalue() == ""
 
 
@@ -73,11 +73,11 @@ def test_functions_of_arrays_document_shapes_and_units(package: str) -> None:
     lacking = []
     for name, node, text, parents_text in definitions(package):
         if isinstance(node, ast.FunctionDef):
-            annotated = [each for each in (*node.args.args, *node.args.kwonlyargs) if each.annotation is not None]
-            arrays = [each for each in annotated if ARRAYS.search(ast.unparse(each.annotation))]
-            searched = f"{text} {parents_text} {' '.join(each.arg.rpartition('_')[2] for each in arrays)}"
+            annotated = [arg for arg in (*node.args.args, *node.args.kwonlyargs) if arg.annotation is not None]
+            arrays = [arg for arg in annotated if ARRAYS.search(ast.unparse(arg.annotation))]
+            searched = f"{text} {parents_text} {' '.join(array.arg.rpartition('_')[2] for array in arrays)}"
             if arrays and not (SHAPE.search(searched) and UNIT.search(searched)):
-                lacking.append((name, "shape" if not SHAPE.search(searched) else "unit", [each.arg for each in arrays]))
+                lacking.append((name, "unit" if SHAPE.search(searched) else "shape", [array.arg for array in arrays]))
     assert lacking == []
 
 

@@ -146,7 +146,7 @@ def test_states_that_were_not_received_are_queried_again() -> None:
     assert [watch.update().state.calibration_id for _ in range(2)] == ["", "night"]
 
 
-def test_a_silent_process_is_left_out() -> None:
+def test_a_silent_process_other_than_the_controller_is_left_out() -> None:
     hub, clock = MemoryHub(), FakeClock()
     watch = Watch(MemoryBus(hub, "operator", clock), clock)
     MemoryBus(hub, "recorder", clock).publisher(HEALTH, "recorder").put(wire.Health(pid=7).SerializeToString())

@@ -81,7 +81,7 @@ def _publish() -> None:
             loop.bench("mask", False)
             if number > FLOOD_HZ * (time.monotonic() - begun_s):
                 time.sleep(0.005)
-        until(lambda: [one.why[:8] for one in loop.status().state.interlocks_acting] == ["no value"])
+        until(lambda: [acting.why[:8] for acting in loop.status().state.interlocks_acting] == ["no value"])
 
 
 def _has_frames(loop: Client) -> bool:
@@ -104,10 +104,10 @@ def _try_to_close(loop: Client) -> bool:
 def _steps_follow_the_inputs(log: Path) -> None:
     """Every step agrees with the interlock inputs before it; a value acts as missing from its maximum age on."""
     types = {STEP.key: wire.ControlStep, CONTROL_INPUT.key: wire.ControlInput}
-    inputs = [types[one.key].FromString(one.payload) for one in LogReader(log, topics=[STEP, CONTROL_INPUT])]
+    messages = [types[read.key].FromString(read.payload) for read in LogReader(log, topics=[STEP, CONTROL_INPUT])]
     changes = held = opened = age_ns = 0
     mask = shut = False
-    for message in sorted(inputs, key=lambda message: message.input_number):
+    for message in sorted(messages, key=lambda message: message.input_number):
         if isinstance(message, wire.ControlStep):
             assert (wire.REASON_HELD in message.reasons) is (mask and message.mode == wire.LOOP_MODE_CLOSED)
             assert not (shut and message.mode == wire.LOOP_MODE_CLOSED)

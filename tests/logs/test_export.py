@@ -56,7 +56,7 @@ CALIBRATED = with_identity(replace(toy.calibration(), good=GOOD.astype(np.float3
 
 
 def a_night() -> SyntheticLog:
-    """30 steps, the first in open loop, one refused; a command and a truth are missing; the camera is restarted."""
+    """30 steps, the first in open loop, one of a dark frame; a command and a truth are missing; the camera restarts."""
     night = SyntheticLog(calibration=CALIBRATED).request("open").frames(1).request("close")
     night.frames(STEPS // 2 - 1, dark={REFUSED - 1})
     night.start_camera()

@@ -35,20 +35,20 @@ LAW_ID = "15560553d408bce3394be8a5123a916a091b94f0a6f0d423cc89d546b4e967f3"
 
 
 @pytest.mark.parametrize(
-    ("log", "lost_bytes", "frames", "changed"),
+    ("log", "bytes_cut", "frames", "changed"),
     [(NIGHT, 0, 163, NIGHT_RULES), (NIGHT, 5000, 163, NIGHT_RULES), (KILLED, 0, 18, {})],
 )
 def test_a_replay_is_identical_except_for_rules_that_changed_on_purpose(
-    log: Path, lost_bytes: int, frames: int, changed: dict[str, int], tmp_path: Path
+    log: Path, bytes_cut: int, frames: int, changed: dict[str, int], tmp_path: Path
 ) -> None:
     """This holds also for a log without its beginning, which names the version of lowfc that wrote it."""
     path = tmp_path / "log.mcap"
-    path.write_bytes(log.read_bytes()[lost_bytes:])
+    path.write_bytes(log.read_bytes()[bytes_cut:])
     # Linear algebra rounds differently on another processor; on the same one there must be no difference.
     results = json_of("replay", path, "--tolerance", 1e-3)
     assert (results["frames"], results["different"], results["unchecked"]) == (frames, 0, 0)
     assert results["rules_changed"] == changed
-    complete = json_of("replay", log, "--tolerance", 1e-3) if lost_bytes else results  # the complete log names its host
+    complete = json_of("replay", log, "--tolerance", 1e-3) if bytes_cut else results  # the complete log names its host
     if not {"blas", "cpu_features", "numpy"} & complete["host_differs"].keys():
         assert (results["identical"], results["largest_difference_nm"]) == (True, 0.0)
 
@@ -62,7 +62,7 @@ def test_the_golden_files_of_the_present_version_can_be_made_and_replayed(tmp_pa
 
 def test_a_replay_with_another_blas_kernel_differs_only_by_rounding() -> None:
     command = [sys.executable, "-m", "lowfc", "replay", str(NIGHT), "--json", "--tolerance", "1e-3"]
-    environment = os.environ | {"OPENBLAS_CORETYPE": "Prescott"}  # SSE3: every x86-64 processor has it
+    environment = os.environ | {"OPENBLAS_CORETYPE": "Prescott"}  # SSE3: every x86-64 processor since 2005 has it
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     results = json.loads(done.stdout)
     assert (done.returncode, results["different"], results["first_difference"]) == (0, 0, None)
@@ -126,14 +126,14 @@ def test_identities_of_calibration_and_law_are_unchanged() -> None:
 
 
 def test_messages_and_enumerations_of_0_1_are_unchanged_except_for_names() -> None:
-    """No field of 0.1 has changed its number, type or label; only the names in the table have changed."""
+    """No field of 0.1 has changed its number, type or label; only the names in `former_names` have changed."""
     former, now = {}, {}
     for declared, folder in ((former, FOLDER), (now, WIRE)):
         for file in FileDescriptorSet.FromString((folder / "lowfc.desc").read_bytes()).file:
             if file.package == "lowfc.v1":
                 for message in file.message_type:
-                    for one in message.field:
-                        declared[message.name, one.number] = one.type, one.type_name, one.label, one.name
+                    for field in message.field:
+                        declared[message.name, field.number] = field.type, field.type_name, field.label, field.name
                 for enum in file.enum_type:
                     declared |= {(enum.name, value.number): (value.name,) for value in enum.value}
     renamed = {
@@ -142,7 +142,7 @@ def test_messages_and_enumerations_of_0_1_are_unchanged_except_for_names() -> No
     }
     assert {key: now.get(key) for key in renamed} == renamed
     names = {f"{kind}.{name}" for (kind, _), (*_, name) in former.items()}
-    assert former_names.FIELDS.keys() <= names, "the table has a name that 0.1 did not have"
+    assert former_names.FIELDS.keys() <= names, "`former_names` has only names that 0.1 had"
 
 
 def test_former_keys_of_a_configuration_give_a_remark() -> None:

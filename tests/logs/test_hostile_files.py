@@ -1,4 +1,4 @@
-"""Hostile files: any file named on a command line or in a configuration leads to a one-line error."""
+"""Hostile files: a malformed file named on a command line or in a configuration leads to a one-line error."""
 
 import gzip
 import io

@@ -30,21 +30,21 @@ def event(name: str, process: str, start_s: int, number: int, **details: object)
 
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
-    """Ten seconds: camera restart, frames 5 to 7 lost after each start, last step lost, events from two processes."""
+    """Ten seconds: the camera restarts; frames 5 to 7 of each start and the last step are lost; two send events."""
     writer = LogWriter(
         tmp_path / "night.mcap",
         START_NS,
         {"lowfc": {"lowfc": "0.1.0", "host": "bench", "run": "night", "seed": "3"}},
         [Attachment("config.toml", "application/toml", b"[loop]\n")],
     )
-    # Calibration loaded an hour before: its time does not extend the log.
+    # The calibration was loaded an hour before: its time does not extend the log.
     writer.write(sample(CALIBRATION.key, wire.Calibration(id="c1"), 0, START_NS - 3600 * SECOND_NS))
     frames = [n for n in range(50) if n not in (5, 6, 7)]
     for number in range(101):
         now_ns = START_NS + number * SECOND_NS // 10
         restarted = number > 50
         count = number - 51 if restarted else number
-        if count in frames:  # any message of a kilobyte will do
+        if count in frames:  # a message of one kilobyte in place of an image
             writer.write(sample(FRAME.key, wire.Health(process="x" * 1000), count, now_ns, START_S + 5 * restarted))
         if number < 100:
             writer.write(sample(STEP.key, wire.ControlStep(), number, now_ns))

@@ -61,12 +61,12 @@ def test_recovered_logs_are_complete(recovered: dict[Path, Counter[str]]) -> Non
 @pytest.mark.node
 def test_foxglove_reads_recovered_logs_completely(recovered: dict[Path, Counter[str]]) -> None:
     logs = foxglove(recovered)
-    assert [(log["counts"], log["counted"]) for log in logs] == [(one, one.total()) for one in recovered.values()]
+    assert [(log["counts"], log["counted"]) for log in logs] == [(sent, sent.total()) for sent in recovered.values()]
     assert all("recovery" in log["metadata"] for log in logs)
 
 
 def test_rerun_reads_recovered_logs_completely(recovered: dict[Path, Counter[str]]) -> None:
-    for path, counts in [one for one in recovered.items() if one[1]][::4]:
+    for path, counts in [(path, counts) for path, counts in recovered.items() if counts][::4]:
         checked = rerun("check", path)
         lines = [line.split() for line in rerun("info", path).splitlines()]
         assert ["Messages", str(counts.total())] in lines
@@ -99,7 +99,7 @@ def test_an_unfinished_log_is_completed(tmp_path: Path) -> None:
     assert copy.records[:-1] == old.records
     assert copy.attachments == {attachment.name: attachment.data for attachment in ATTACHMENTS}
     assert copy.metadata.keys() == {"lowfc", "recovery"}
-    for reader in (old, copy):  # except for the numbers, which each file assigns
+    for reader in (old, copy):  # each file assigns its own numbers
         for channel in reader.channels.values():
             channel.schema_id = reader.schemas[channel.schema_id].data
             channel.id = 0

@@ -78,7 +78,7 @@ class Night:
         self._start()
 
     def restart(self) -> None:
-        """The controller dies and restarts."""
+        """Let the controller die and restart."""
         self.start_s += 1
         self._start()
 
@@ -435,7 +435,7 @@ def test_frames_are_kept_within_a_limit_of_memory(monkeypatch: pytest.MonkeyPatc
     found = [store.frame(sequence, sequence, 0) for sequence in range(50)]
     assert found[49].pixels is not None
     assert np.array_equal(found[49].pixels, pixels + 49)
-    assert [one is not None for one in found].count(True) == 4
+    assert [kept is not None for kept in found].count(True) == 4
     assert store.frame(49, 48, 0) is None
     assert store.frame(49, 48, 0, any_time=True) is not None
 
@@ -466,10 +466,10 @@ def test_logs_in_another_order_than_recorded_are_refused(log: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize("other", ["b", "a"])
-def test_two_lockstep_runs_with_the_same_sequences_are_replayed_apart(
+def test_two_lockstep_runs_with_the_same_sequences_are_replayed_separately(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, other: str
 ) -> None:
-    """This holds also for two runs of the same name (`sim-loop --lockstep --run a`)."""
+    """This also holds for two runs of the same name (`sim-loop --lockstep --run a`)."""
     paths: list[Path] = []
     for run, gain in (("a", 0.1), (other, 0.2)):
         night = report_log.SyntheticLog().request("gain", (gain,)).frames(200)

@@ -166,8 +166,8 @@ def test_the_longest_stretch_under_one_law_is_analysed(eventful: dict[str, Any])
 
 
 def test_the_error_budget_agrees_with_the_known_noise_and_disturbance(eventful: dict[str, Any]) -> None:
-    used, dn_noise = SyntheticLog().calibration, np.hypot(READ_NOISE_E, 12**-0.5)  # with rounding to whole DN
-    noise = sensor_noise(used.reconstructor.astype(float), used.reference.astype(float), used.flux_dn, dn_noise)
+    used, noise_dn = SyntheticLog().calibration, np.hypot(READ_NOISE_E, 12**-0.5)  # 1 e/DN; with rounding to whole DN
+    noise = sensor_noise(used.reconstructor.astype(float), used.reference.astype(float), used.flux_dn, noise_dn)
     terms = {term["name"]: term for term in eventful["error_budget"]["terms"]}
     noise_to_residual = np.sqrt([noise_gain(gain, 0.0, 1.0) for gain in (0.4, 0.4, 0.2)])
     groups = ("tilt x", "tilt y", "other modes")
@@ -227,6 +227,7 @@ def test_the_verdict_names_what_was_wrong(eventful: dict[str, Any]) -> None:
 
 
 def uneventful(night: SyntheticLog, frames: int = 300) -> SyntheticLog:
+    """The log with frames without fault between two Healths of the camera."""
     return night.health("camera", state="ready").frames(frames).health("camera", state="stopped")
 
 
@@ -425,7 +426,7 @@ def test_a_calibration_of_other_modes_leaves_out_former_steps_only_if_it_is_the_
     """Frames of steps that are left out still led to commands."""
     night = SyntheticLog().frames(100)
     two = encode_calibration(with_identity(calibration(NOLL[:2])), night.now_ns)
-    night.put(CALIBRATION, two)  # refused: the controller publishes the one in use again
+    night.put(CALIBRATION, two)  # refused: the controller publishes the calibration in use again
     night.put(CALIBRATION, encode_calibration(night.calibration, night.now_ns))
     night.frames(100)
     for steps in (200, 0):
@@ -567,7 +568,8 @@ def test_the_timing_of_a_live_log_is_that_of_the_mirrors_reports(
     night.instants = 8
     stretch = closed_loop.longest_stretch(read_run(night.frames(300).write(tmp_path / "x.mcap")))
     assert stretch is not None
-    assert stretch.timing == (1.0, pytest.approx(0.725, abs=0.026), 0.5, 1.0)  # exposed 0.5 ms, moved 0.2 ms later
+    # In periods of 1 ms; the mirror moves 0.2 ms after its command.
+    assert stretch.timing == (1.0, pytest.approx(0.725, abs=0.026), 0.5, 1.0)
 
 
 def test_the_stretch_of_a_law_ends_where_the_law_is_overruled(tmp_path: Path) -> None:
