@@ -157,6 +157,7 @@ def test_a_folder_that_cannot_be_written_is_an_error(bench: Bench) -> None:
 
 
 def entry(topic: Topic, count: int, start_s: int = 100, payload: bytes = b"", key: str = "") -> tuple[Topic, Sample]:
+    """Topic and sample of the message number `count` of a publisher that started at `start_s`."""
     return topic, Sample(key or topic.key, payload, sequence_of(start_s, count), 0, 0)
 
 

@@ -56,7 +56,7 @@ def fields(optics):
 
 
 def noise_nm2(I0, H, light_e, read_noise_e, estimator):
-    """Covariance of the modes, by propagating the noise of each pixel through the reconstructor."""
+    """Covariance (modes, modes), nm^2, by propagating the noise of each pixel through the reconstructor."""
     variance = (I0 * light_e + read_noise_e**2) / light_e**2
     root = np.ones(len(I0)) if estimator == "pinv" else variance**-0.5
     R = np.linalg.pinv(H * root[:, None]) * root

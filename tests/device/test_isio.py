@@ -31,7 +31,7 @@ from tests.support.image_streams.plain import FLOAT32, INT32, UINT16, PlainStrea
 CONFIG = Configuration()
 ROWS, COLUMNS = 6, 8
 GRID = (CONFIG.mirror.rows, CONFIG.mirror.columns)
-AT_NS = 1_700_000_000_000_000_000
+TIME_NS = 1_700_000_000_000_000_000
 
 
 @pytest.fixture(autouse=True)
@@ -85,11 +85,11 @@ def test_pixels_of_any_type_are_converted_to_dn(
     assert exposure.pixels.tolist() == [expected]
 
 
-@pytest.mark.parametrize(("atime", "expected"), [("end", AT_NS), ("start", AT_NS + 2_000_000), ("none", None)])
+@pytest.mark.parametrize(("atime", "expected"), [("end", TIME_NS), ("start", TIME_NS + 2_000_000), ("none", None)])
 def test_frames_are_timed_at_the_end_of_the_exposure(folder: Path, atime: str, expected: int | None) -> None:
     writer = PlainStream.make(file_of(folder, "camnsv"), COLUMNS, ROWS, UINT16)
     driver, _ = camera(atime=atime, exposure_us=2000.0)
-    writer.write(np.zeros((ROWS, COLUMNS)), AT_NS)
+    writer.write(np.zeros((ROWS, COLUMNS)), TIME_NS)
     exposure = driver.expose()
     assert exposure.end_ns == expected
     assert driver.settings().clock == "realtime"
@@ -394,8 +394,8 @@ def test_the_stroke_limit_applies_to_the_sum_of_channels() -> None:
     flat, beside, target = (np.zeros(GRID, np.float32) for _ in range(3))
     beside[2, 2], beside[4, 4], beside[6, 6], beside[8, 8] = 700, 900, -900, 700
     target[2, 2], target[4, 4], target[6, 6], target[8, 8], target[9, 9] = 100, 100, 100, -100, 100
-    command = Command("lowfc", 1, AT_NS, 10**9, target, np.ones(2, np.float32))
-    status, reason = apply_command(protection, Status(flat, flat), command, AT_NS, lambda shape, _: shape, beside)
+    command = Command("lowfc", 1, TIME_NS, 10**9, target, np.ones(2, np.float32))
+    status, reason = apply_command(protection, Status(flat, flat), command, TIME_NS, lambda shape, _: shape, beside)
     assert reason is None
     assert status.limits_hit == (Limit.STROKE,)
     assert not status.command_nm.size
@@ -404,7 +404,7 @@ def test_the_stroke_limit_applies_to_the_sum_of_channels() -> None:
     assert reached[4, 4] == 0  # the other channels already exceed the stroke in this direction
     assert (reached[6, 6], reached[8, 8], reached[9, 9]) == (100, -100, 100)
     assert np.abs(reached + beside)[2, 2] < CONFIG.mirror.stroke_nm / 2
-    status, _ = apply_command(protection, Status(flat, flat), command, AT_NS, lambda shape, _: shape, flat)
+    status, _ = apply_command(protection, Status(flat, flat), command, TIME_NS, lambda shape, _: shape, flat)
     assert np.array_equal(status.surface_nm, target)
     assert not status.limits_hit
 

@@ -1,6 +1,6 @@
 """Files in deploy: valid systemd units, containers, and processes that report to their supervisor.
 
-The test starts the processes as their units do, with its own socket in place of systemd's.
+One test starts the processes as their units do, with its own socket in place of systemd's.
 """
 
 import contextlib

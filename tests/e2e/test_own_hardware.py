@@ -110,7 +110,7 @@ def test_the_loop_closes_with_a_users_camera_and_mirror(folder: Path) -> None:
             errors_nm.append(list(wire.ControlStep.FromString(sample.payload).error_nm))
 
         def rms_nm() -> float:
-            """Norm of the mean error of the last 100 steps: the residual without noise; NaN if any step has no error."""
+            """Norm of the mean error of the last 100 steps: the residual without noise; NaN without 100 errors."""
             measured = [error for error in errors_nm[-100:] if error]
             return float(np.linalg.norm(np.mean(measured, axis=0))) if len(measured) == 100 else np.nan
 
@@ -149,12 +149,12 @@ def test_the_camera_of_the_tutorial_passes_conformance(folder: Path, own_runtime
     assert "2 ok" in command(folder, DOCTOR)
 
 
-TEXT = (ROOT / "docs/howto/commissioning.md").read_text()
-COMMISSIONING = re.findall(r"^    ((?:python|lowfc) .*)$", TEXT, flags=re.MULTILINE)
+COMMISSIONING_PAGE = (ROOT / "docs/howto/commissioning.md").read_text()
+COMMISSIONING = re.findall(r"^    ((?:python|lowfc) .*)$", COMMISSIONING_PAGE, flags=re.MULTILINE)
 *PAGE_DEVICES, CONTROLLER, COMMISSION, LATER = COMMISSIONING
 
 
-def block(language: str, page: str = TEXT) -> str:
+def block(language: str, page: str = COMMISSIONING_PAGE) -> str:
     """The page's listing in this language."""
     (listing,) = re.findall(rf"^```{language}\n(.*?)^```$", page, flags=re.MULTILINE | re.DOTALL)
     return str(listing)

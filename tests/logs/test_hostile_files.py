@@ -132,6 +132,7 @@ def test_only_regular_files_are_read(tmp_path: Path, kind: str, make: Callable[[
 
 
 def npy(header: bytes) -> bytes:
+    """A .npy file of this header and 64 zero bytes of data."""
     header += b"\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(64)
 
@@ -163,6 +164,7 @@ def npz() -> bytes:
 
 
 def damaged_in_the_middle(compress: Callable[[bytes], bytes]) -> bytes:
+    """A compressed FITS image, with one bit changed in the middle of the file."""
     content = io.BytesIO()
     fits.PrimaryHDU(np.random.default_rng(1).normal(size=(34, 34))).writeto(content)
     damaged = bytearray(compress(content.getvalue()))

@@ -59,7 +59,7 @@ from tests.support.mutated_logs import chunks_of, flipped
 from tests.support.toy import NOLL, calibration, frame, settings
 
 START_S = 1_767_225_600
-STATE_EVERY = 12
+STATE_EVERY = 12  # inputs
 STEPS = 600
 EXAMPLES = 40
 SHAPE = np.full(20, 3, np.float32)
@@ -147,6 +147,7 @@ def replay(
 
 
 def night_of(input_list: list[Input], **changes: object) -> Night:
+    """Log of a controller that has these changed settings and receives these inputs."""
     night = Night(settings(**(TIGHT | changes)))
     for one in input_list:
         night.apply(one)
@@ -178,6 +179,7 @@ def after_camera_restart(input_list: list[Input]) -> list[Input]:
 
 
 def frames(count: int, first: int = 0) -> list[Input]:
+    """Frames of random wavefronts, numbered from `first`."""
     rng = np.random.default_rng(first)
     return [frame(first + index, rng.normal(0, 4, len(NOLL))) for index in range(count)]
 
@@ -359,8 +361,8 @@ def raise_actuator(command: Any, number: int) -> None:
     command.actuators = surface.tobytes()
 
 
-def tampered(night: Night, topic: Topic, number: int, change: str) -> Account:
-    """Change one message slightly, and replay."""
+def replay_tampered(night: Night, topic: Topic, number: int, change: str) -> Account:
+    """Change one message of a log, and replay the log."""
     messages = list(night.messages)
     index = night.indices(topic)[number]
     body = topic.message.FromString(messages[index].payload)
@@ -385,7 +387,7 @@ def tampered(night: Night, topic: Topic, number: int, change: str) -> Account:
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_the_smallest_difference_is_found_and_reported(topic: Topic, change: str, expected: str) -> None:
-    account = tampered(night_of(frames(60)), topic, 2, change)
+    account = replay_tampered(night_of(frames(60)), topic, 2, change)
     assert not account.identical
     assert account.first_difference.message == topic.message.DESCRIPTOR.name
     assert any(line.startswith(expected) for line in account.first_difference.fields), account.first_difference.fields
@@ -414,7 +416,7 @@ def test_commands_that_are_not_in_the_log_are_counted() -> None:
 def test_a_log_without_input_numbers_is_refused() -> None:
     night = night_of(frames(3))
     with pytest.raises(DataFileError, match="the steps in this log are not numbered"):
-        tampered(night, STEP, 0, "body.input_number = 0")
+        replay_tampered(night, STEP, 0, "body.input_number = 0")
     night.messages.append(Sample(REQUEST.key, wire.Request(name="gain").SerializeToString(), 0, 0, 0))
     assert replay(night.messages).identical
 
