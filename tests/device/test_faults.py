@@ -190,7 +190,7 @@ def test_expose_may_return_none_and_settings_are_published_twice_a_second_meanwh
     begun_ns, bench.camera.expose = bench.clock.now_ns(), wait
     bench.loop.run()
     times_ms = [(sample.publish_time_ns - begun_ns) // MS_NS for sample in bench.listener.samples[CAMERA_STATE]]
-    assert times_ms == [0, 0, 500, 1000, 1500, 2000], "at the start, with the first exposure, twice a second"
+    assert times_ms == [0, 0, 500, 1000, 1500, 2000], "at the start, before the first exposure, twice a second"
     assert bench.listener.events() == ["STARTED", "STOPPED"]
 
 
@@ -307,7 +307,7 @@ def test_commands_are_limited_and_the_mirror_goes_flat_after_the_command_timeout
     bench = MirrorBench(mirror)
     assert mirror.heights_nm == [0.0], "driven to flat at the start: its position is unknown"
     bench.command(200.0)
-    assert mirror.heights_nm[1:] == [150.0], "the slew limit of [mirror]"
+    assert mirror.heights_nm[1:] == [150.0], "the slew limit of [mirror] acts"
     assert bench.command(200.0, (5, 4)).refused == Limit.WRONG_GRID
     assert bench.command(float("nan")).refused == Limit.NOT_FINITE
     assert len(mirror.heights_nm) == 2
@@ -350,7 +350,7 @@ def test_a_failed_mirror_goes_flat_before_it_follows_commands_again(bad: Any, me
     bench.command(300.0)
     assert mirror.heights_nm == [0.0, 140.0, 280.0, 300.0], "the mirror gets no further command"
     bench.tick()
-    assert (len(mirror.heights_nm), bench.state().actuators) == (5, b""), "retried at once, and failed again"
+    assert (len(mirror.heights_nm), bench.state().actuators) == (5, b""), "the retry follows at once, and fails"
     bench.tick()
     assert len(mirror.heights_nm) == 5, "no call during the pause"
     bench.tick(100)

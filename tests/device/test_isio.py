@@ -438,7 +438,7 @@ def test_a_refused_report_of_other_channels_is_repeated_every_two_seconds(
     for tick in range(100):
         now_s = tick * 0.1
         others.report_changes()
-    assert requested_s == [0.0, 2.0, 4.0, 6.0], "refused three times, then accepted"
+    assert requested_s == [0.0, 2.0, 4.0, 6.0], "three reports are refused, then one is accepted"
 
 
 def test_a_shape_of_other_channels_is_removed_only_if_the_controller_has_one(folder: Path) -> None:

@@ -51,7 +51,7 @@ def test_a_restarted_camera_process_publishes_frames_of_a_new_start(tmp_path: Pa
     with closing(ZenohBus(open_run("dying").links, Role.RECORDER, HostClock())) as bus:
         bus.subscribe(FRAME, lambda sample: starts.append(start_of(sample.sequence)))
         died = subprocess.run([*LOWFC, *arguments], cwd=tmp_path, timeout=60, check=False)
-        assert died.returncode == 7, "a failure: the units in deploy restart it"
+        assert died.returncode == 7, "status 7 is a failure: the units in deploy restart it"
         with in_background(tmp_path, f"lowfc {' '.join(arguments)}"):
             until(lambda: len(set(starts)) == 2)
     assert starts == sorted(starts)
@@ -197,7 +197,7 @@ def test_a_mirror_hang_of_five_seconds_blocks_commands_and_the_mirror_goes_flat_
         assert (bench.states[-1].actuators, bench.states[-1].status) == (b"", wire.MIRROR_STATUS_EXPIRED)
         until(lambda: list(bench.steps[-1].reasons) == [wire.REASON_NO_MIRROR])
         until(lambda: len(bench.calls_nm()) > len(before))
-        assert time.monotonic() - begun_s > 4, "no command arrived while it hung"
+        assert time.monotonic() - begun_s > 4, "no command arrived while the mirror hung"
         until(lambda: bench.count_of("mirror-dm", "DRIVER_BACK") and bench.count_of("controller", "MIRROR_BACK"))
         repeated_nm, flat_nm = bench.calls_nm()[len(before) :][:2]
         assert (repeated_nm, flat_nm) == (pytest.approx(before[-1], abs=1), 0), "the mirror's last shape, then flat"
@@ -239,7 +239,7 @@ def test_a_dead_mirror_process_is_reported_and_the_loop_holds_until_its_restart(
             time.sleep(1.2)
             before_nm = list(bench.steps[-1].command_nm)
             bench.inject("mirror", "die")
-            assert process.wait(10) == 7, "a failure: the units in deploy restart it"
+            assert process.wait(10) == 7, "status 7 is a failure: the units in deploy restart it"
         finally:
             process.kill()
     until(lambda: bench.count_of("controller", "MIRROR_LOST"))

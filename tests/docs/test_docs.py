@@ -217,7 +217,7 @@ def test_the_documented_commands_read_a_log(tmp_path: Path) -> None:
     assert "is intact" in printed[4]
     assert "1 in 10 frames and mirror states" in printed[7]
     assert "digest " in printed[8]
-    assert "-every-10.mcap" not in printed[8], "`last` is the recorded log"
+    assert "-every-10.mcap" not in printed[8], "`last` names the recorded log, not its export"
     assert {path.suffix for path in (tmp_path / "logs").iterdir()} == {".mcap", ".html", ".fits"}
 
 

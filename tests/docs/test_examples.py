@@ -51,7 +51,7 @@ def test_a_log_becomes_a_data_frame_with_a_column_for_each_mode(run: Callable[..
         "flux_dn",
     ]
     assert rows[0][1] == "156.0"
-    assert rows[-1][1] == "156.0", "without the 7 refused frames, whose flux is unknown"
+    assert rows[-1][1] == "156.0", "the count excludes the 7 refused frames, whose flux is unknown"
 
 
 def test_a_night_compared_with_itself_has_the_same_verdict_and_values(run: Callable[..., list[str]]) -> None:

@@ -186,7 +186,7 @@ def test_the_commands_print_what_they_did(night: Night) -> None:
     assert 'preset = "bench"' in outputs["lowfc ctl configuration"]
     assert "loop closed for 50 frames, from frame" in outputs["lowfc ctl step 50"]
     assert "gain is now 0.4 0.4 0.05" in outputs["lowfc ctl gain 0.4 --modes 2,3"]
-    assert outputs["lowfc ctl gain auto"].startswith("the gain of Z2"), "without --modes: all modes"
+    assert outputs["lowfc ctl gain auto"].startswith("the gain of Z2"), "without --modes, all modes get a gain"
     assert "leak is now 0 0 0.001 0.001" in outputs["lowfc ctl leak 0.001 --modes 4-11"]
     assert "offset is now 0 0 5 0" in outputs["lowfc ctl offset 5 -3 --modes 4,11"]
     assert "channel dark-hole: 1.47 nm rms of surface" in outputs["lowfc ctl channel dark-hole shape.npy"]

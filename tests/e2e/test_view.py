@@ -158,7 +158,7 @@ def test_the_web_view_shows_the_live_loop_and_fetches_from_this_host_only(live: 
         picture = artefacts / "live-browser.png"
         good = FILL[Level.GOOD]
         page = browser_screenshot(address.group(), picture, 120, lambda shown: share_of(shown, good) > 0.01, (560, 350))
-        assert share_of(pixels(picture.read_bytes()), good) > 0.01, "no tile has the colour of a good state"
+        assert share_of(pixels(picture.read_bytes()), good) > 0.01, "a tile has the colour of a good state"
         assert {url.startswith(("http://127.0.0.1", "data:", "blob:")) for url in page.fetched.values()} == {True}
     finally:
         _, stderr = interrupt(process)

@@ -50,7 +50,7 @@ def test_interlocks_act_on_values_within_a_period_and_a_flood_of_values_loses_no
     assert process.returncode == 0, stderr
     results = json.loads(out)
     assert results["frames_missing"] == results["messages_lost"] == 0
-    assert results["frames_skipped"] < FLOOD_S * RATE_HZ / 5, "stalls of the host skip some, a flood would skip most"
+    assert results["frames_skipped"] < FLOOD_S * RATE_HZ / 5, "stalls of the host skip few frames, a flood most"
     log = tmp_path / results["log"]
     replayed = json.loads(output_of(tmp_path, f"lowfc replay --json {log}"))
     assert replayed["identical"]

@@ -640,7 +640,7 @@ def test_text_of_a_log_is_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         assert re.search(rf"{digit}( ?&lt;script&gt;| \$)", text), digit
     for name in ("host", "kernel", "processor", "lowfc"):
         assert f"{name} &lt;script&gt;" in text
-    assert text.count("3 $x^2$") == 2, "in the drawing and in the table"
+    assert text.count("3 $x^2$") == 2, "the name is in the drawing and in the table"
 
 
 @pytest.mark.usefixtures("without_drawings")
