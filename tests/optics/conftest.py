@@ -24,13 +24,13 @@ def sensor():
 
 @pytest.fixture(scope="session")
 def modes(sensor):
-    """The 20 modes (20, 512, 512) at the pupil's samples."""
+    """The 20 Zernike modes (20, 512, 512), of unit rms, at the pupil's samples."""
     return zernikes(NOLLS_20, *pupil_radii(sensor))
 
 
 @pytest.fixture(scope="session")
 def coefficients_nm():
-    """20 wavefronts (20, 20) within the paper's bounds: 0.04 waves rms for radial degrees 1 and 2, 0.016 above."""
+    """Modes (20 wavefronts, 20), nm rms; the paper's bounds are 0.04 waves for radial degrees 1 and 2, 0.016 above."""
     bounds_nm = 550.0 * np.where(np.array(NOLLS_20) <= 6, 0.04, 0.016)
     return np.random.default_rng(20).uniform(-1, 1, (20, 20)) * bounds_nm
 
@@ -60,7 +60,7 @@ def hcipy():
 
 @pytest.fixture(scope="session")
 def prysm():
-    """prysm, another independent diffraction code; version 0.21 imports pkg_resources, which setuptools has no more."""
+    """prysm, another independent diffraction code; version 0.21 imports pkg_resources, which setuptools has dropped."""
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         stand_in = SimpleNamespace(get_distribution=importlib.metadata.distribution)

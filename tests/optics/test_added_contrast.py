@@ -1,4 +1,4 @@
-"""Contrast added by a wavefront: the quadratic form against full science images, and its range of validity."""
+"""Contrast added by a wavefront: a quadratic form in its modes, compared with full science images."""
 
 from collections.abc import Callable
 
@@ -31,32 +31,32 @@ def form(shaped: Coronagraph) -> Array:
 def added_in_image(shaped: Coronagraph, modes: Array) -> AddedInImage:
     def added(modes_nm: Array) -> float:
         flat, aberrated = (
-            mean_contrast(shaped, np.tensordot(one, modes[: len(NOLL)], 1), WAVELENGTH_NM, DARK_ZONE, 4)
-            for one in (0 * modes_nm, modes_nm)
+            mean_contrast(shaped, np.tensordot(each_nm, modes[: len(NOLL)], 1), WAVELENGTH_NM, DARK_ZONE, 4)
+            for each_nm in (0 * modes_nm, modes_nm)
         )
         return aberrated - flat
 
     return added
 
 
-@pytest.mark.parametrize(("tilt_nm", "error"), [(1.0, 0.0), (10.0, -0.14), (40.0, -0.74)])
+@pytest.mark.parametrize(("tilt_nm", "relative_error"), [(1.0, 0.0), (10.0, -0.14), (40.0, -0.74)])
 def test_quadratic_form_underestimates_large_tilt(
-    added_in_image: AddedInImage, form: Array, tilt_nm: float, error: float
+    added_in_image: AddedInImage, form: Array, tilt_nm: float, relative_error: float
 ) -> None:
     modes_nm = tilt_nm * np.eye(len(NOLL))[0]
-    assert modes_nm @ form @ modes_nm / added_in_image(modes_nm) - 1 == pytest.approx(error, abs=0.01)
+    assert modes_nm @ form @ modes_nm / added_in_image(modes_nm) - 1 == pytest.approx(relative_error, abs=0.01)
 
 
 def test_spherical_adds_thousands_of_times_more_contrast_than_tilt(form: Array) -> None:
-    each = np.diag(form)
-    assert 3000 < each[NOLL.index(11)] / each[0] < 6000
-    assert each.argmax() == NOLL.index(11)
+    of_mode = np.diag(form)
+    assert 3000 < of_mode[NOLL.index(11)] / of_mode[0] < 6000
+    assert of_mode.argmax() == NOLL.index(11)
 
 
-def test_contrast_of_tilt_agrees_with_a_dark_zone_sampled_far_more_finely(shaped: Coronagraph, form: Array) -> None:
+def test_contrast_added_by_tilt_agrees_with_finer_sampled_images(shaped: Coronagraph, form: Array) -> None:
     axis = 2 * pupil_axis(len(shaped.pupil))
     tilt_nm = zernikes((2,), axis, axis[:, None])[0]
-    flat, plus, minus = (mean_contrast(shaped, a * tilt_nm, WAVELENGTH_NM, DARK_ZONE, 16) for a in (0.0, 1.0, -1.0))
+    flat, plus, minus = (mean_contrast(shaped, x * tilt_nm, WAVELENGTH_NM, DARK_ZONE, 16) for x in (0.0, 1.0, -1.0))
     assert form[0, 0] == pytest.approx((plus + minus) / 2 - flat, rel=0.12, abs=0)
 
 
@@ -66,22 +66,22 @@ def test_form_without_negative_eigenvalues_differs_little(form: Array) -> None:
     assert np.linalg.norm(semidefinite - form) < 1e-3 * np.linalg.norm(form)
 
 
-def test_contrast_is_summed_by_group_and_large_tilt_is_beyond_quadratic(
+def test_added_contrast_is_summed_by_group_and_that_of_large_tilt_is_not_quadratic(
     shaped: Coronagraph, added_in_image: AddedInImage
 ) -> None:
-    """The cross term of two modes is included in the sum, half of it in each mode."""
+    """The cross term of two modes is shared: half of it counts for each mode."""
     modal, coma, tilt = ModalContrast(shaped, NOLL, WAVELENGTH_NM), NOLL.index(8), NOLL.index(2)
     shape = np.zeros(len(NOLL))
     shape[[coma, coma - 1, tilt]] = 0.3
-    each = modal.by_mode(np.outer(shape, shape))
-    assert each.sum() == pytest.approx(added_in_image(shape), rel=0.01, abs=0)
-    groups = by_group(NOLL, each)
-    assert groups["coma"] == pytest.approx(each[coma] + each[coma - 1], abs=0)
+    by_mode = modal.by_mode(np.outer(shape, shape))
+    assert by_mode.sum() == pytest.approx(added_in_image(shape), rel=0.01, abs=0)
+    groups = by_group(NOLL, by_mode)
+    assert groups["coma"] == pytest.approx(by_mode[coma] + by_mode[coma - 1], abs=0)
     assert costliest(groups) == ("coma", 1.0), "the cross term with coma makes the share of tilt negative"
     assert costliest({"coma": 3.0, "focus": 1.0, "tilt": -9.0}) == ("coma", 0.75)
     assert not modal.is_beyond_quadratic(0.3**2 * np.eye(len(NOLL)))
     assert modal.is_beyond_quadratic(20**2 * np.diag(np.eye(len(NOLL))[tilt]))
-    assert not modal.is_beyond_quadratic(0.5**2 * np.diag(np.eye(len(NOLL))[tilt])), "the images differ by rounding"
+    assert not modal.is_beyond_quadratic(0.5**2 * np.diag(np.eye(len(NOLL))[tilt])), "form and image differ by rounding"
 
 
 def test_added_contrast_of_a_run_is_that_of_its_second_half(shaped: Coronagraph, added_in_image: AddedInImage) -> None:

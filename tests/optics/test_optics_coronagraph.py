@@ -1,4 +1,4 @@
-"""The science image: contrast, phase screens, and the fast image against the exact one."""
+"""Contrast of the science image, phase screens, and the fast science image compared with the exact one."""
 
 import numpy as np
 import pytest
@@ -48,10 +48,10 @@ def test_shaped_pupil_contrast_is_below_1e_9_in_its_dark_zone(shaped, flat):
     assert image[dark].max() < 1e-9
     assert image[~dark].max() > 0.9
     fewer_rows = contrast(shaped, flat, WAVELENGTH_NM, 160, 108)
-    np.testing.assert_allclose(fewer_rows, image[26:134], rtol=1e-9, atol=1e-16)  # a smaller image is a part of it
+    np.testing.assert_allclose(fewer_rows, image[26:134], rtol=1e-9, atol=1e-16)  # the middle rows of the larger image
 
 
-def test_a_tilt_moves_the_star(shaped):
+def test_a_tilt_shifts_the_image_of_the_star(shaped):
     ramp = WAVELENGTH_NM * (3.0 * pupil_axis(512) + 0.5 * pupil_axis(512)[:, None])  # 3 and 1/2 waves across the pupil
     image = contrast(shaped, ramp, WAVELENGTH_NM, 64)
     x = image_axis(64, 4)
@@ -96,10 +96,10 @@ def test_screens_have_the_structure_function_of_a_periodic_kolmogorov_screen():
     for i in range(24):
         screen = kolmogorov(np.random.default_rng([1, i]), samples, width)
         for k, shift in enumerate(separations):
-            steps = [screen[shift:] - screen[:-shift], screen[:, shift:] - screen[:, :-shift]]
-            found[k] += np.mean([np.mean(step**2) for step in steps]) / 24
+            differences = [screen[shift:] - screen[:-shift], screen[:, shift:] - screen[:, :-shift]]
+            found[k] += np.mean([np.mean(each**2) for each in differences]) / 24
     r = separations / samples
-    # The screen has no power in the zero-frequency cell: the integral begins at the rim of a disk of equal area.
+    # The screen has no power in the cell of zero frequency: the integral begins at the rim of a disk of its area.
     f = np.geomspace(1.0 / (width * np.sqrt(np.pi)), samples / 2, 4000)
     density = 0.0229 * f ** (-11 / 3) * 2 * np.pi * f
     expected = 2 * np.trapezoid(density * (1 - j0(2 * np.pi * r[:, None] * f)), f, axis=1)
@@ -122,7 +122,7 @@ def camera(shaped):
 
 
 def wavefront(**nm):
-    """Modes (14,) from keywords Z<Noll index>, nm."""
+    """Modes (14,), nm rms, from keywords Z<Noll index>; the others are zero."""
     return np.array([nm.get(f"Z{index}", 0.0) for index in NOLLS_14])
 
 
@@ -137,20 +137,20 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_fast_science_image_agrees_with_the_exact_image_to_one_percent(shaped, modes, camera, name):
-    """Each sample agrees to 1 % of itself plus 0.1 % of the mean plus 1 % of the flat wavefront's contrast."""
-    opd_nm = np.tensordot(CASES[name], modes[:14], 1)
+@pytest.mark.parametrize("case", CASES)
+def test_fast_science_image_agrees_with_the_exact_image_to_one_percent(shaped, modes, camera, case):
+    """Tolerance of a sample: 1 % of its value, 0.1 % of the mean, and 1 % of the mean with a flat wavefront."""
+    opd_nm = np.tensordot(CASES[case], modes[:14], 1)
     exact = contrast(shaped, opd_nm, WAVELENGTH_NM, camera.samples, samples_per=SAMPLES_PER)
-    found = camera.image(CASES[name])
+    found = camera.image(CASES[case])
     dark = wedge_samples(Wedge(4.0, HALF_WIDTH), camera.samples, camera.samples, SAMPLES_PER)
     np.testing.assert_allclose(found[dark], exact[dark], rtol=1e-2, atol=4e-12 + 1e-3 * exact[dark].mean())
     mean = mean_contrast(shaped, opd_nm, WAVELENGTH_NM, RING, SAMPLES_PER)
     assert camera.mean_contrast(found, RING) == pytest.approx(mean, rel=2e-3)
-    assert np.abs(found - exact).max() < 1e-3  # including the star's core
+    assert np.abs(found - exact).max() < 1e-3  # in the whole image, the star's core included
 
 
-def test_a_pupil_that_is_not_made_of_2_x_2_squares_is_summed_sample_by_sample():
+def test_the_fast_image_of_a_pupil_without_2_x_2_blocks_agrees_with_the_exact_image():
     plain = Coronagraph(circle(64))
     modes_nm = np.array([20.0, -35.0, 12.0])
     radii = 2 * pupil_axis(64)

@@ -8,7 +8,7 @@ from lowfc.optics.detector.detector import Detector, expose, noise_table_of, sat
 from lowfc.optics.detector.detector_noise_table import FAINT_E, STEP_E
 from lowfc.optics.detector.photometry import Photometry, electrons, tilt_nm_per_mas
 
-QUIET = Detector(read_noise_e=0.0, bias_dn=0.0)
+NO_READ_NOISE = Detector(read_noise_e=0.0, bias_dn=0.0)
 
 
 def flat(mean_e, side=400):
@@ -20,7 +20,7 @@ def rng():
 
 
 def probabilities(camera, mean_e, numbers):
-    """Probability of each digital number, from the Poisson and normal distributions."""
+    """Probability of each of these digital numbers, from the Poisson and normal distributions."""
     electrons_e = np.arange(400)
     edges = (np.append(numbers, numbers[-1] + 1) - 0.5 - camera.bias_dn) * camera.gain_e_per_dn
     read = np.diff(scipy.stats.norm.cdf((edges - electrons_e[:, None]) / camera.read_noise_e), axis=1)
@@ -32,14 +32,14 @@ CAMERAS = [Detector(), Detector(gain_e_per_dn=0.7, read_noise_e=0.4, bias_dn=90.
 
 @pytest.mark.parametrize("camera", [*CAMERAS, Detector(gain_e_per_dn=2.0, read_noise_e=0.12, bias_dn=100.5)])
 def test_noise_table_has_the_exact_distribution_at_its_levels(camera):
-    """Entries and remainder together have the distribution of Poisson noise, read noise and rounding."""
+    """The table's entries and its remainder together have the distribution of Poisson and read noise and rounding."""
     table = noise_table_of(camera)
     numbers = np.arange(table.first_dn, table.first_dn + table.remainder.shape[1])
     for level in (0, 1, 2, 17, 64, 500, len(table.entries) - 1):
         entries = table.entries[level].astype(int)
-        of_remainder = (entries > numbers[-1]).sum()
+        from_remainder = (entries > numbers[-1]).sum()  # draws that the second distribution decides
         found = np.bincount(entries[entries <= numbers[-1]] - numbers[0], minlength=len(numbers)).astype(float)
-        found += of_remainder * np.diff(table.remainder[level].astype(float), prepend=0.0)
+        found += from_remainder * np.diff(table.remainder[level].astype(float), prepend=0.0)
         assert 0.5 * np.abs(found / len(entries) - probabilities(camera, level * STEP_E, numbers)).sum() < 1e-7
 
 
@@ -52,19 +52,19 @@ def test_a_million_pixels_pass_the_chi_square_test(camera, mean_e):
     numbers = np.arange(400)
     expected = count * probabilities(camera, float(np.float32(mean_e)), numbers)
     found = np.bincount(frame.ravel(), minlength=400)
-    often = expected > min_expected  # all other numbers form one class
-    expected = np.append(expected[often], max(count - expected[often].sum(), min_expected))
-    found = np.append(found[often], found[~often].sum())
-    assert scipy.stats.chi2.sf(np.sum((found - expected)[:-1] ** 2 / expected[:-1]), often.sum() - 1) > 1e-3
+    frequent = expected > min_expected  # all other numbers form one class
+    expected = np.append(expected[frequent], max(count - expected[frequent].sum(), min_expected))
+    found = np.append(found[frequent], found[~frequent].sum())
+    assert scipy.stats.chi2.sf(np.sum((found - expected)[:-1] ** 2 / expected[:-1]), frequent.sum() - 1) > 1e-3
     assert found[-1] < 10 * min_expected
 
 
-def test_an_exact_camera_has_no_noise_table_and_the_mean_and_variance_of_a_camera_with_one():
+def test_an_exact_camera_has_no_noise_table_but_the_same_mean_and_variance():
     camera = Detector(exact=True)
     assert noise_table_of(camera) is None
-    exact, drawn = (expose(one, flat(2.3), rng()).astype(float) for one in (camera, Detector()))
-    assert exact.mean() == pytest.approx(drawn.mean(), abs=0.03)
-    assert exact.var() == pytest.approx(drawn.var(), rel=0.03)
+    exact, from_table = (expose(one, flat(2.3), rng()).astype(float) for one in (camera, Detector()))
+    assert exact.mean() == pytest.approx(from_table.mean(), abs=0.03)
+    assert exact.var() == pytest.approx(from_table.var(), rel=0.03)
 
 
 def test_faint_and_bright_pixels_of_one_frame_are_independent():
@@ -74,14 +74,14 @@ def test_faint_and_bright_pixels_of_one_frame_are_independent():
     assert np.abs(np.corrcoef(frame.T) - np.eye(5)).max() < 0.05
 
 
-def test_multiplication_has_the_excess_noise_of_a_long_register():
+def test_electron_multiplication_doubles_the_variance_as_a_long_register_does():
     camera = Detector(gain_e_per_dn=10.0, read_noise_e=0.0, bias_dn=0.0, full_well_e=6e5, em_gain=100.0)
-    frame = expose(camera, flat(20.0), rng()).astype(float) / 10.0  # in input electrons
+    frame = expose(camera, flat(20.0), rng()).astype(float) / 10.0  # electrons before multiplication
     assert frame.mean() == pytest.approx(20.0, rel=0.01)
     assert frame.var() == pytest.approx(2 * 20.0, rel=0.03)
 
 
-def test_clock_induced_charge_is_multiplied_like_light():
+def test_clock_induced_charge_is_multiplied_like_photoelectrons():
     camera = Detector(read_noise_e=0.0, bias_dn=0.0, em_gain=100.0, clock_induced_charge_e=0.05)
     assert expose(camera, flat(0.0), rng()).mean() == pytest.approx(5.0, rel=0.05)
     assert expose(Detector(read_noise_e=0.0, bias_dn=0.0), flat(0.0), rng()).max() == 0
@@ -114,10 +114,10 @@ def test_same_seed_gives_the_same_frame_and_input_is_unchanged():
 
 
 def test_negative_electrons_count_as_zero_and_nan_is_an_error():
-    assert expose(QUIET, flat(-1e-9, 4), rng()).max() == 0
+    assert expose(NO_READ_NOISE, flat(-1e-9, 4), rng()).max() == 0
     assert expose(Detector(), flat(-1.0), rng()).mean() == pytest.approx(100, abs=0.02)  # drawn from the table
     with pytest.raises(ValueError, match="finite number, got nan"):
-        expose(QUIET, flat(np.nan, 4), rng())
+        expose(NO_READ_NOISE, flat(np.nan, 4), rng())
 
 
 @pytest.mark.parametrize(

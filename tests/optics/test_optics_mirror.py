@@ -30,7 +30,7 @@ def test_poke_has_unit_height_and_neighbours_have_the_coupling():
     assert np.unravel_index(surface.argmax(), surface.shape) == (10, 20)
 
 
-def test_rows_and_columns_may_differ():
+def test_numbers_of_rows_and_columns_may_differ():
     mirror = Mirror(rows=3, columns=5, pitches_per_pupil=4)
     u = pupil_axis(16)
     commands = modes_to_actuators(mirror, [2, 3])
@@ -48,24 +48,24 @@ def test_active_actuators_are_those_in_the_pupil_and_one_ring_around_it():
 
 
 def wavefronts_and_modes(commands):
-    """Wavefronts (20, samples in the pupil) of the commands (actuators, 20), and the modes."""
+    """Wavefronts (20, samples in the pupil) of commands (actuators, 20), and the modes at the same samples."""
     u = pupil_axis(256)
     inside, factors = np.hypot(u[:, None], u) <= 0.5, influence_factors(MIRROR, u, 34)
     wavefronts = [2.0 * (factors @ each.reshape(34, 34) @ factors.T)[inside] for each in commands.T]
     return np.array(wavefronts), zernikes(NOLLS_20, 2 * u, 2 * u[:, None])[:, inside]
 
 
-def test_modes_to_actuators_gives_the_modes_with_half_the_surface():
+def test_the_command_of_a_mode_makes_a_surface_of_half_the_mode():
     commands = modes_to_actuators(MIRROR, NOLLS_20)
     assert commands.shape == (34 * 34, 20)
     assert not commands[~active_actuators(MIRROR).ravel()].any()
     wavefronts, targets = wavefronts_and_modes(commands)
-    assert ((wavefronts - targets).std(axis=1) < 0.016).all()  # print-through: 1.3 %, 1.6 % for the worst mode
+    assert ((wavefronts - targets).std(axis=1) < 0.016).all()  # print-through: 1.3 % on average, 1.6 % at most
     assert (wavefronts * targets).sum(axis=1) / (targets**2).sum(axis=1) == pytest.approx(1.0, abs=2e-3)
 
 
 def test_neighbours_compensate_for_unusable_actuators():
-    """The modes are more accurate than with the unusable actuators of a full fit set to zero."""
+    """The modes are more accurate than those of a fit of all actuators whose unusable ones are then set to zero."""
     usable = np.ones((34, 34), bool)
     usable[10, 12] = usable[16, 17] = usable[17, 17] = usable[22, 9] = usable[25, 24] = False
     commands = modes_to_actuators(MIRROR, NOLLS_20, usable)

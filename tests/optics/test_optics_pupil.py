@@ -1,4 +1,4 @@
-"""Grid conventions, Zernike modes, pupils and focal-plane masks against closed forms."""
+"""Grid conventions, Zernike modes, pupils and focal-plane masks, compared with closed forms and hcipy."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from lowfc.optics.chain.zernike import mode_name, noll_to_orders, zernike
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.9, 1.1])
-def test_relay_pupil_is_upright_and_energy_is_conserved(scale):
+def test_relay_pupil_is_not_inverted_and_energy_is_conserved(scale):
     u = pupil_axis(128)
     pupil = np.exp(-((u - 0.2) ** 2 + (u[:, None] + 0.1) ** 2) / 0.08**2).astype(complex)
     focal = to_image(pupil, 360, 8, scale)
@@ -47,8 +47,8 @@ def test_every_mode_agrees_with_hcipy(hcipy):
     inside = np.hypot(x, y) <= 1
     for noll in range(1, 67):
         assert tuple(hcipy.noll_to_zernike(noll)) == noll_to_orders(noll)
-        theirs = np.asarray(hcipy.zernike_noll(noll, 1.0, grid))[inside]
-        np.testing.assert_allclose(zernike(noll, x, y)[inside], theirs, rtol=0, atol=1e-12 * np.abs(theirs).max())
+        expected = np.asarray(hcipy.zernike_noll(noll, 1.0, grid))[inside]
+        np.testing.assert_allclose(zernike(noll, x, y)[inside], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
 def test_polynomials_continue_outside_the_circle():
@@ -58,7 +58,7 @@ def test_polynomials_continue_outside_the_circle():
     assert zernike(11, 0.0, 2.0) == pytest.approx(np.sqrt(5) * (6 * 16 - 6 * 4 + 1))
 
 
-def test_mode_names_give_the_axis():
+def test_mode_names_differ_and_end_with_the_axis_of_the_mode():
     names = {noll: mode_name(noll) for noll in range(1, 30)}
     assert len(set(names.values())) == 29
     expected = {2: "tilt x", 3: "tilt y", 4: "focus", 7: "coma y", 8: "coma x", 11: "spherical"}
@@ -77,18 +77,19 @@ def test_noll_indices_below_one_are_refused():
 def test_bar_reaches_from_the_centre_to_the_edge_on_one_side(angle_deg):
     barred, angle = circle_with_bar(512, 0.1, angle_deg), np.deg2rad(angle_deg)
 
-    def at(radius, across):
+    def transmission(radius, across):
         x = radius * np.cos(angle) - across * np.sin(angle)
         y = radius * np.sin(angle) + across * np.cos(angle)
         return barred[int((y + 0.5) * 512), int((x + 0.5) * 512)]
 
     for radius in (0.02, 0.25, 0.48):
-        assert at(radius, 0.0) == at(radius, 0.045) == at(radius, -0.045) == 0
-        assert at(-radius, 0.0) == 1
-    assert at(0.25, 0.055) == at(0.25, -0.055) == 1
+        assert transmission(radius, 0.0) == transmission(radius, 0.045) == transmission(radius, -0.045) == 0
+        assert transmission(-radius, 0.0) == 1
+    assert transmission(0.25, 0.055) == transmission(0.25, -0.055) == 1
     # The bar's area: a rectangle and the segment of the circle at its end.
-    half = np.arcsin(0.1)
-    rectangle, segment = 0.1 * 0.5 * np.cos(half), 0.25 * (half - np.sin(half) * np.cos(half))
+    half_angle = np.arcsin(0.1)
+    rectangle = 0.1 * 0.5 * np.cos(half_angle)
+    segment = 0.25 * (half_angle - np.sin(half_angle) * np.cos(half_angle))
     assert (circle(512) - barred).mean() == pytest.approx(rectangle + segment, rel=0.02)
 
 
@@ -98,7 +99,7 @@ def apodised():
 
 
 def encircled(pupil, radius):
-    """Fraction of a pupil's light within a radius (lambda/D) in the image plane, and the field there."""
+    """Fraction of a pupil's light within a radius (lambda/D) in the image plane, and the field within it."""
     samples_per = 32
     x = image_axis(2 * int(np.ceil(radius * samples_per)), samples_per)
     field = to_image(pupil.astype(complex), x.size, samples_per, 1.0) * (np.hypot(x[:, None], x) <= radius)
@@ -106,14 +107,14 @@ def encircled(pupil, radius):
 
 
 def test_prolate_pupil_is_an_eigenfunction_of_the_mask(apodised):
-    """The eigenvalue of the circular prolate function is the fraction of light on the mask."""
+    """The eigenvalue of the circular prolate function is the fraction of the light within the mask."""
     encircled_fraction, field = encircled(apodised, 2.5)
     back = to_pupil(field, 256, 32, 1.0)
     inside = circle(256) > 0
     assert np.abs(back[inside] - encircled_fraction * apodised[inside]).max() < 1e-3
 
 
-def test_prolate_pupil_is_symmetric_and_has_the_throughput_of_its_asymptote(apodised):
+def test_prolate_pupil_is_symmetric_and_has_the_throughput_of_a_gaussian(apodised):
     assert apodised.max() <= 1
     assert apodised[127:129, 127:129] == pytest.approx(1, abs=1e-3)
     assert not apodised[circle(256) == 0].any()

@@ -1,4 +1,4 @@
-"""Every sensor against closed forms, independent propagators and finite differences."""
+"""Images and responses of every sensor, compared with closed forms, independent propagators, finite differences."""
 
 from dataclasses import replace
 
@@ -18,8 +18,8 @@ from lowfc.optics.detector.detector import Detector, expose
 from tests.support.in_process_loop import configuration
 
 
-def relative_l2(ours, truth):
-    return np.linalg.norm(ours - truth) / np.linalg.norm(truth)
+def relative_l2(found, expected):
+    return np.linalg.norm(found - expected) / np.linalg.norm(expected)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def binned(intensity):
 
 
 @pytest.mark.parametrize("wavelength_nm", [550.0, 500.0])
-def test_the_chain_agrees_with_hcipy(hcipy, sensor, opd_nm, wavelength_nm):
+def test_the_image_agrees_with_hcipy(hcipy, sensor, opd_nm, wavelength_nm):
     def focal_grid(samples):
         return hcipy.CartesianGrid(hcipy.RegularCoords([1 / 8, 1 / 8], [samples] * 2, [-(samples - 1) / 16] * 2))
 
@@ -45,13 +45,13 @@ def test_the_chain_agrees_with_hcipy(hcipy, sensor, opd_nm, wavelength_nm):
     focal.electric_field *= sensor.focal_mask.ravel()
     relay = to_mask.backward(focal)
     relay.electric_field *= sensor.relay.transmission.ravel()
-    theirs = binned(np.abs(np.asarray(to_sensor.forward(relay).electric_field).reshape(160, 160)) ** 2)
-    ours = image(sensor, opd_nm, monochromatic(wavelength_nm))
-    assert relative_l2(ours, theirs / (64 * np.pi / 4)) < 1e-12
+    expected = binned(np.abs(np.asarray(to_sensor.forward(relay).electric_field).reshape(160, 160)) ** 2)
+    found = image(sensor, opd_nm, monochromatic(wavelength_nm))
+    assert relative_l2(found, expected / (64 * np.pi / 4)) < 1e-12
 
 
-def test_the_chain_agrees_with_prysm(prysm, sensor, opd_nm):
-    # The paper's Table 1 in prysm's units (mm, um). prysm's grids have a sample on the axis: `ramp` shifts by half.
+def test_the_image_agrees_with_prysm(prysm, sensor, opd_nm):
+    # The paper's Table 1 in prysm's units (mm, um). prysm has a sample on the axis: `ramp` shifts by half a sample.
     u = (np.arange(512) - 256) / 512
     ramp = np.exp(-2j * np.pi * (u + u[:, None]) / 16)
     pupil_mm, focal_mm, wavelength_um = 10.0, 200.0, 0.55
@@ -65,9 +65,9 @@ def test_the_chain_agrees_with_prysm(prysm, sensor, opd_nm):
     at_sensor = prysm.focus_fixed_sampling(
         relay * sensor.relay.transmission, pupil_mm / 512, output_dx=step_um, output_samples=160, **optics
     )
-    theirs = binned(np.abs(at_sensor) ** 2)
-    ours = image(sensor, opd_nm)
-    assert relative_l2(ours / ours.sum(), theirs / theirs.sum()) < 1e-12
+    expected = binned(np.abs(at_sensor) ** 2)
+    found = image(sensor, opd_nm)
+    assert relative_l2(found / found.sum(), expected / expected.sum()) < 1e-12
 
 
 @pytest.mark.parametrize("name", ["sam", "clowfs", "zwfs"])
@@ -82,7 +82,7 @@ def test_broadband_images_and_responses_are_weighted_sums(name, modes, opd_nm):
         np.testing.assert_allclose(quantity(band), np.tensordot(band.weights, each, 1), rtol=1e-12, atol=1e-15)
 
 
-def test_three_gauss_legendre_wavelengths_beat_the_papers_five(sensor):
+def test_three_gauss_legendre_wavelengths_are_more_accurate_than_the_papers_five(sensor):
     truth = reference(sensor, gauss_legendre(550.0, count=9))
     error_of_three = relative_l2(reference(sensor, gauss_legendre(550.0)), truth)
     error_of_five = relative_l2(reference(sensor, uniform(550.0)), truth)
@@ -110,7 +110,7 @@ def test_throughput_is_the_product_of_the_elements(sensor, modes):
     assert np.linalg.cond(response(sensor, modes[:14])) == pytest.approx(26.5, rel=0.03)
 
 
-def test_the_bowtie_adds_light_above_and_below(sensor):
+def test_the_bowtie_mask_is_open_also_above_and_below_the_centre(sensor):
     bowtie = sensor_named("bowtie").focal_mask
     assert sensor.focal_mask.shape == (64, 64)
     assert bowtie.shape == (160, 160)
@@ -137,7 +137,7 @@ def test_sensor_refuses_inconsistent_shapes(sensor):
         Sensor(sensor.pupil, sensor.focal_mask, sensor.relay, wavelength_nm=0.0)
 
 
-def at_the_mask(optics, opd_nm, wavelength_nm):
+def field_after_mask(optics, opd_nm, wavelength_nm):
     """Field after the focal-plane mask."""
     start = optics.pupil * np.exp(2j * np.pi / wavelength_nm * opd_nm)
     return to_image(start, len(optics.focal_mask), 8, 550.0 / wavelength_nm) * optics.focal_mask
@@ -158,27 +158,27 @@ def test_the_defocused_image_agrees_with_hcipy(hcipy, opd_nm, wavelength_nm):
     samples, small_wavelength = 512, 1e-3
     grid = hcipy.make_uniform_grid([samples] * 2, [samples / 8] * 2)
     start = np.zeros((samples, samples), complex)
-    start[224:288, 224:288] = at_the_mask(optics, opd_nm, wavelength_nm)
+    start[224:288, 224:288] = field_after_mask(optics, opd_nm, wavelength_nm)
     free_space = hcipy.FresnelPropagator(grid, optics.relay.distance / small_wavelength)
     wave = hcipy.Wavefront(hcipy.Field(start.ravel(), grid), small_wavelength * wavelength_nm / 550.0)
     at_detector = np.asarray(free_space.forward(wave).electric_field).reshape(samples, samples)[176:336, 176:336]
-    theirs, ours = np.abs(at_detector) ** 2, np.abs(field(optics, opd_nm, wavelength_nm)) ** 2
-    scale = np.vdot(theirs, ours) / np.vdot(theirs, theirs)
+    expected, found = np.abs(at_detector) ** 2, np.abs(field(optics, opd_nm, wavelength_nm)) ** 2
+    scale = np.vdot(expected, found) / np.vdot(expected, expected)
     assert scale == pytest.approx(1, abs=1e-3)
-    assert relative_l2(ours, scale * theirs) < 1e-3
+    assert relative_l2(found, scale * expected) < 1e-3
 
 
 @pytest.mark.parametrize("defocus_mm", [1.5, 6.0])
 def test_defocused_image_agrees_with_a_quadratic_phase_in_the_relay_pupil(opd_nm, defocus_mm):
     """Expected: the Fresnel integral, by the angular spectrum over all frequencies that the samples resolve."""
     optics = sensor_from(SensorSection(kind="clowfs", defocus_mm=defocus_mm))
-    x, u = image_axis(64, 8), image_axis(4096, 512)  # 8 D of relay pupil
+    x, u = image_axis(64, 8), image_axis(4096, 512)  # u: 8 D of the relay pupil's plane
     window = np.cos(np.clip((np.abs(u) - 3.0) * np.pi / 2, 0, np.pi / 2)) ** 2  # its rim sends no light to the detector
     transfer = window * np.exp(-1j * np.pi * optics.relay.distance * u**2)
     propagator = np.exp(2j * np.pi * np.outer(image_axis(160, 8), u)) * transfer @ np.exp(-2j * np.pi * np.outer(u, x))
     propagator /= 8 * 512
-    theirs = propagator @ at_the_mask(optics, opd_nm, 550.0) @ propagator.T
-    assert relative_l2(field(optics, opd_nm, 550.0), theirs) < 1e-3
+    expected = propagator @ field_after_mask(optics, opd_nm, 550.0) @ propagator.T
+    assert relative_l2(field(optics, opd_nm, 550.0), expected) < 1e-3
 
 
 @pytest.mark.parametrize("wavelength_nm", [550.0, 500.0])
@@ -193,24 +193,24 @@ def test_pupil_image_agrees_with_hcipy(hcipy, opd_nm, wavelength_nm):
     focal = hcipy.FraunhoferPropagator(pupil_grid, focal_grid).forward(hcipy.Wavefront(start, wavelength_nm / 550.0))
     focal.electric_field *= optics.focal_mask.ravel()
     at_detector = np.asarray(hcipy.FraunhoferPropagator(detector, focal_grid).backward(focal).electric_field)
-    theirs = np.abs(at_detector.reshape(80, 80)) ** 2 * optics.pitch**2 / (np.pi / 4)
-    ours = image(optics, opd_nm, monochromatic(wavelength_nm))
-    assert relative_l2(ours, theirs.reshape(40, 2, 40, 2).sum(axis=(1, 3))) < 1e-12
+    expected = np.abs(at_detector.reshape(80, 80)) ** 2 * optics.pitch**2 / (np.pi / 4)
+    found = image(optics, opd_nm, monochromatic(wavelength_nm))
+    assert relative_l2(found, expected.reshape(40, 2, 40, 2).sum(axis=(1, 3))) < 1e-12
 
 
 def test_direct_kernels_conserve_energy():
-    """A sampled focal plane repeats its image; over one period the columns of each kernel are orthonormal."""
+    """A sampled focal plane gives a periodic image; over one period the columns of each kernel are orthonormal."""
     distance = 27.25  # the period, 8 times this distance, is an integer number of samples
     matrix = direct_kernel(Defocus(distance), 1744, 64, 8, 1.0)
     np.testing.assert_allclose(matrix.conj().T @ matrix, np.eye(64), atol=1e-12)
     for scale in (1.0, 1.1):
         matrix = direct_kernel(PupilImage(8.0 / scale), 512, 64, 8, scale)
-        unitary = matrix.conj().T @ matrix * (8.0 / scale / 512) * 8  # times the sample density of the focal plane
-        np.testing.assert_allclose(unitary, np.eye(64), atol=1e-12)
+        products = matrix.conj().T @ matrix * (8.0 / scale / 512) * 8  # the samples in the focal plane are 1/8 apart
+        np.testing.assert_allclose(products, np.eye(64), atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["clowfs", "zwfs"])
-def test_without_relay_mask_light_is_lost_only_at_the_detector_edge(name):
+def test_without_relay_mask_light_is_lost_only_outside_the_detector(name):
     optics = sensor_named(name)
     budget = light_budget(optics)
     assert budget.relay_mask == 1
@@ -256,23 +256,23 @@ def test_shear_moves_the_image(name, axis):
     I0 = reference(fine)
     slope = slope_along(lambda samples: np.roll(I0, samples, axis=1 - axis), fine.pitch / moves_by)
     inner = np.s_[8:-8, 8:-8]
-    ours = shear_response(fine)[:, axis].reshape(I0.shape)
-    assert relative_l2(ours[inner], slope[inner]) < 1e-4
+    found = shear_response(fine)[:, axis].reshape(I0.shape)
+    assert relative_l2(found[inner], slope[inner]) < 1e-4
 
 
 @pytest.mark.parametrize("name", ["clowfs", "zwfs", "bar"])
-def test_another_wavelength_is_equivalent_to_scaled_hardware(name):
-    """At lambda = 1.25 lambda0 a sample of lambda0/8D is lambda/10D, and the same millimetres are less defocus."""
+def test_another_wavelength_is_equivalent_to_rescaled_optics(name):
+    """At lambda = 1.25 lambda0 a sample of lambda0/8D is lambda/10D, and the same distance in mm is less defocus."""
     optics, longer_nm = sensor_named(name), 687.5
-    ours = reference(optics, monochromatic(longer_nm))
+    found = reference(optics, monochromatic(longer_nm))
     relay = optics.relay
     if isinstance(relay, Defocus):
         relay = Defocus(relay.distance / 1.25)
     scaled = replace(optics, relay=relay, wavelength_nm=longer_nm, samples_per=10)
-    np.testing.assert_allclose(ours, reference(scaled), rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(found, reference(scaled), rtol=1e-9, atol=1e-15)
 
 
-def test_the_papers_defocus_has_a_better_condition_number_than_a_third_or_twice_of_this_defocus(modes):
+def test_the_papers_defocus_has_a_better_condition_number_than_a_third_or_twice_of_it(modes):
     def condition(defocus_mm):
         optics = sensor_from(SensorSection(kind="clowfs", defocus_mm=defocus_mm))
         return np.linalg.cond(response(optics, modes[:14]))
@@ -305,7 +305,7 @@ def test_behind_an_aperture_mask_modal_responses_are_odd_but_image_and_shear_res
 
 
 def calibrated(**changed):
-    """A calibration with a small mirror, and its noise, from configuration keys."""
+    """Calibration with a small mirror for these configuration keys, and noise of a frame (modes,), nm rms."""
     keys = {"mirror.rows": 12, "mirror.columns": 12, "mirror.pitches_per_pupil": 11.0}
     config = configuration(keys, **changed)
     optics = factory.twin(config, None, pytest.fail)
@@ -315,7 +315,7 @@ def calibrated(**changed):
 
 @pytest.mark.parametrize(("name", "noise_factor"), [("clowfs", (3, 8)), ("zwfs", (1.2, 2))])
 def test_fitting_shear_and_background_removes_their_bias(name, noise_factor):
-    """Beam sheared by 0.002 D plus 10 % uniform light; the noise of x tilt, the mode most like shear, increases."""
+    """Beam sheared by 0.002 D plus 10 % uniform light; the noise of tilt x, the mode most like shear, increases."""
     optics = sensor_named(name)
     ramp = np.exp(-2j * np.pi * 0.002 * image_axis(64, 8))
     sheared = reference(replace(optics, focal_mask=optics.focal_mask * ramp)).ravel()

@@ -1,4 +1,4 @@
-"""The cache of twins and fitted mirrors."""
+"""The cache of twins, fitted mirrors and contrast forms."""
 
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -23,13 +23,13 @@ from lowfc.optics.chain.mirror import Mirror
 from lowfc.optics.chain.relay import ApertureMask
 from lowfc.optics.twin.twin import Evaluator, TwinSpec
 
-SMALL = TwinSpec(nodes=16, order=4, rank=40, guards=4)  # coarse, for tests of the cache file
+SMALL = TwinSpec(nodes=16, order=4, rank=40, guards=4)  # a coarse twin: only the cache file is tested
 HASH_OF_ONES = "a4449a9f81f26403e8a1f5dda2c0cbe7385184dc0b31b34b2b78eb5a92ba3eec"
 
 
 @pytest.fixture(scope="module")
 def sensor(sensor):
-    """The default sensor with a coarse pupil, for tests of the cache file."""
+    """The default sensor with a coarse pupil, of which twins are built fast."""
     transmission = sensor.relay.transmission[::4, ::4]
     return replace(sensor, pupil=sensor.pupil[::4, ::4], relay=ApertureMask(transmission))
 
@@ -55,14 +55,14 @@ def assert_same(first, second):
     assert first.operator_hash == second.operator_hash
 
 
-def forbidden(*_):
-    raise AssertionError("built again")
+def not_expected(*_):
+    raise AssertionError("built again, or a file was reported")
 
 
 def test_broadband_twins_are_read_back_unchanged(sensor, tmp_path):
     band = gauss_legendre(550.0, count=2)
     built = load_or_build(sensor, SMALL, band, cache_dir=tmp_path)
-    again = load_or_build(sensor, SMALL, band, cache_dir=tmp_path, progress=forbidden, notice=forbidden)
+    again = load_or_build(sensor, SMALL, band, cache_dir=tmp_path, progress=not_expected, notice=not_expected)
     assert_same(built, again)
     assert again.operator_hash == operator_hash(sensor, SMALL, band)
     assert [each.weight for each in again.operators] == list(band.weights)
@@ -124,7 +124,7 @@ def test_damaged_file_is_reported_and_rebuilt(sensor, stored, tmp_path):
         content[: len(content) // 2],
         b"",
         content[:damaged_byte] + bytes([content[damaged_byte] ^ 1]) + content[damaged_byte + 1 :],
-        other.read_bytes(),
+        other.read_bytes(),  # a valid file of another twin
     ):
         path.write_bytes(damaged)
         progress, notices = Mock(), []
@@ -133,10 +133,10 @@ def test_damaged_file_is_reported_and_rebuilt(sensor, stored, tmp_path):
         assert str(path) in notice
         progress.assert_called_with(32, 32)
         assert_same(twin, again)
-        assert_same(twin, load_or_build(sensor, SMALL, cache_dir=tmp_path, progress=forbidden, notice=forbidden))
+        assert_same(twin, load_or_build(sensor, SMALL, cache_dir=tmp_path, progress=not_expected, notice=not_expected))
 
 
-def test_a_directory_that_cannot_be_written_is_not_fatal(sensor, stored, tmp_path):
+def test_a_twin_is_built_even_if_its_cache_directory_cannot_be_written(sensor, stored, tmp_path):
     file = tmp_path / "file"
     file.write_text("not a directory")
     notices = []
@@ -150,7 +150,7 @@ def test_concurrent_builds_give_one_valid_file(sensor, tmp_path):
         twins = list(pool.map(lambda _: load_or_build(sensor, SMALL, cache_dir=tmp_path), range(2)))
     assert_same(*twins)
     assert [path.suffix for path in tmp_path.iterdir()] == [".npz"]
-    assert_same(twins[0], load_or_build(sensor, SMALL, cache_dir=tmp_path, progress=forbidden, notice=forbidden))
+    assert_same(twins[0], load_or_build(sensor, SMALL, cache_dir=tmp_path, progress=not_expected, notice=not_expected))
 
 
 def test_the_cache_is_in_the_users_xdg_cache_folder(monkeypatch, tmp_path):
@@ -178,9 +178,9 @@ def test_mirror_is_cached_and_a_damaged_file_is_refitted(stored, sensor, tmp_pat
 
 
 def test_contrast_forms_are_read_back_unchanged_and_depend_on_every_input(tmp_path, monkeypatch):
-    pupil, opaque = np.ones((16, 16)), np.eye(32)
-    lyot = LyotStop(opaque, pupil)
-    other_mask, other_stop = LyotStop(np.tri(32), pupil), LyotStop(opaque, np.tri(16))
+    pupil, mask = np.ones((16, 16)), np.eye(32)
+    lyot = LyotStop(mask, pupil)
+    other_mask, other_stop = LyotStop(np.tri(32), pupil), LyotStop(mask, np.tri(16))
     optics = Coronagraph(pupil, Wedge(), lyot), (2, 3), 550.0
     variants = [
         optics,
@@ -193,7 +193,7 @@ def test_contrast_forms_are_read_back_unchanged_and_depend_on_every_input(tmp_pa
         (optics[0], (2, 3), 551.0),
     ]
     forms = [load_or_compute_form(*each, cache_dir=tmp_path) for each in variants]
-    monkeypatch.setattr(twin_cache, "contrast_form", forbidden)
+    monkeypatch.setattr(twin_cache, "contrast_form", not_expected)
     for each, form in zip(variants, forms, strict=True):
-        np.testing.assert_array_equal(load_or_compute_form(*each, cache_dir=tmp_path, notice=forbidden), form)
+        np.testing.assert_array_equal(load_or_compute_form(*each, cache_dir=tmp_path, notice=not_expected), form)
     assert len({form.tobytes() for form in forms}) == len(variants)
