@@ -64,8 +64,9 @@ ADVICE: dict[str, tuple[str, str]] = {
         "keep it if it is a dark hole; else `lowfc ctl channel adopted --zero`.",
     ),
     "FLAT_NOT_IN_FORCE": (
-        "the mirror reported late, and with the channels set before, the map of `mirror.flat` exceeds a limit.",
-        "change those channels, then `lowfc ctl channel flat FILE`.",
+        "other channels had been set before the mirror's first report; added to them, the map of `mirror.flat` exceeds "
+        "a limit.",
+        "change these channels, then `lowfc ctl channel flat FILE`.",
     ),
     "LAW_NOT_IN_FORCE": (
         "the law of `control.law` was refused: no calibration of the law's modes is loaded, or the camera's settings "
@@ -88,7 +89,8 @@ ADVICE: dict[str, tuple[str, str]] = {
     ),
     "GAINS_CHANGED": ("automatic gains changed.", _NOTHING),
     "STAR_CHANGED": (
-        "the flux changed by more than 20 % for half a second; automatic gains are lowered and measured again.",
+        "the flux changed by more than 20 % for half a second and 20 frames; automatic gains are lowered and measured "
+        "again.",
         "nothing after a slew; else check for clouds, a vignetted beam or a changed exposure.",
     ),
     "LOOP_HARMS": (
@@ -185,7 +187,7 @@ ADVICE: dict[str, tuple[str, str]] = {
         "the disk is nearly full, a write failed, or the folder is gone. A log is readable up to its last flush.",
         "free some space or restore the folder, then `lowfc ctl record start`; the loop continues without a log.",
     ),
-    "DISK_SLOW": ("one write took long; messages waited in memory.", "use a faster or less busy disk."),
+    "DISK_SLOW": ("one write to the disk took long; messages waited in memory.", "use a faster or less busy disk."),
     "ON_EVENT_FAILED": (
         "the shell command of `recorder.on_event` failed or took more than 60 s.",
         "run the command by hand and correct it.",
@@ -215,7 +217,7 @@ REASONS: dict[str, tuple[str, str]] = {
         "superseded it",
         "`lowfc doctor`; check the clocks of the hosts",
     ),
-    "SATURATED": ("more than `control.max_saturated_pixels` pixels are at full well", "shorter exposure, lower gain"),
+    "SATURATED": ("over `control.max_saturated_pixels` good pixels are at full well", "shorter exposure, lower gain"),
     "DARK": (
         "the flux is less than `control.min_flux_fraction` of the calibration's flux",
         "centre the star on the mask; for a fainter star `lowfc calibrate reference`, or a lower fraction",
@@ -238,7 +240,7 @@ REASONS: dict[str, tuple[str, str]] = {
         "an actuator reached its slew limit in one command",
         "nothing, if the loop has just closed or been reset; else lower gains",
     ),
-    "NEIGHBOUR": ("neighbours would differ too much in height", "smaller channels; look for a stuck actuator"),
+    "NEIGHBOUR": ("neighbouring actuators would differ by too much", "smaller channels; look for a stuck actuator"),
     "NOT_FINITE": ("a value was not finite; the previous command is kept", "check calibration and law"),
     "WRONG_GRID": ("the grid differs from the mirror's", "load the calibration of this mirror"),
     "CHANNEL": (

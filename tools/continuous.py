@@ -1,4 +1,4 @@
-"""Theoretical continuous-time residual of the wheel's five lines, by law: a table of docs/howto/tuning.md."""
+"""Theoretical continuous-time residual of the wheel's five lines under each law: a table of docs/howto/tuning.md."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ _CASES = (Timing.of(1, 0.5), Timing.of(1, 0.9), Timing.of(2, 0.5))
 
 
 def table() -> str:
-    """A row for each law, a column for each timing; mas rms per axis."""
+    """A row for each law, a column for each timing; residuals in mas rms per axis."""
     laws = {
         "integrator, highest gain": [
             integrator([highest_gain(timing.delay)], [0.0], (2,), timing.delay, RATE_HZ) for timing in _CASES
@@ -37,7 +37,7 @@ def table() -> str:
         ],
     }
     rows = [
-        (name, *(f"{residual_mas(law, t):.3f}" for law, t in zip(by_timing, _CASES, strict=True)))
+        (name, *(f"{residual_mas(law, timing):.3f}" for law, timing in zip(by_timing, _CASES, strict=True)))
         for name, by_timing in laws.items()
     ]
     rows.append(("lower bound for a command held for a period", *(f"{floor_mas():.3f}" for _ in _CASES)))
@@ -47,13 +47,13 @@ def table() -> str:
 
 
 def kalman(timing: Timing, start: float, length: float) -> LinearLaw:
-    """Kalman filter with the exact lines; its command nulls the mean error over [start, start + length] periods."""
+    """Kalman filter with the exact lines; each command nulls the mean error from `start`, for `length` periods."""
     predicted_mean = WHEEL.mean_over(start, length) @ np.linalg.inv(WHEEL.mean_over(0.0, timing.exposure))
     return replace(lqg([WHEEL], (2,), timing), output=(-WHEEL.states()[2] @ predicted_mean)[None].astype(np.float32))
 
 
 def floor_mas() -> float:
-    """Least residual that a command held for a period can leave, mas rms."""
+    """Least residual of the lines with a command that is held for a period, mas rms."""
     return float(np.sqrt(np.square(LINES_MAS) @ hold_floor(_OMEGA)))
 
 

@@ -1,4 +1,4 @@
-"""Fraction of a dark hole's steps that the loop undoes: the table of docs/howto/zero_point.md."""
+"""Fraction of a dark hole's steps that the loop undoes: a table of docs/howto/zero_point.md."""
 
 import tempfile
 from pathlib import Path
@@ -42,7 +42,7 @@ def render(results: Results) -> str:
             f"{run['together_nm']:.1f}",
             f"{run['seen_nm']:.1f}",
             *(f"{100 * run[name]['undone']:.2f} +- {100 * run[name]['error']:.2f}" for name in (SHIFTED, PLAIN)),
-            " -> ".join(f"{left:.2f}" for left in run[SHIFTED]["left_nm"]),
+            " -> ".join(f"{residual_nm:.2f}" for residual_nm in run[SHIFTED]["left_nm"]),
         )
         for step_rms_nm, run in results["runs"].items()
     ]

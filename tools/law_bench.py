@@ -36,7 +36,7 @@ RATE_HZ = 1000.0
 def configured(
     sensor: str = "sam27d10_bal14", seed: int = 1, delay_frames: float = 1.0, **changed: Any
 ) -> Configuration:
-    """Reaction wheel of 14 mas rms per axis, V = 0, 1 kHz; `changed` has further keys."""
+    """Configuration with a reaction wheel of 14 mas rms per axis, V = 0, 1 kHz; `changed` has further keys."""
     keys: dict[str, Any] = {f"sensor.{key}": value for key, value in sensor_keys(sensor).items()}
     keys |= FIXED_GAINS | {
         "camera.rate_hz": RATE_HZ,
@@ -55,16 +55,16 @@ def calibrated(config: Configuration) -> Calibration:
 
 def with_lines_moved(disturbance: Disturbance, factor: float) -> Disturbance:
     """The same disturbance with the frequencies of its lines multiplied by `factor`."""
-    ideal = np.isin(disturbance.frequency_hz, LINES_HZ)
+    of_lines = np.isin(disturbance.frequency_hz, LINES_HZ)
     return replace(
         disturbance,
-        frequency_hz=np.where(ideal, factor, 1) * disturbance.frequency_hz,
+        frequency_hz=np.where(of_lines, factor, 1) * disturbance.frequency_hz,
         lines=tuple(replace(line, frequency_hz=factor * line.frequency_hz) for line in disturbance.lines),
     )
 
 
 class Bench:
-    """A loop in one process that starts with a flat mirror. `new_record` discards the record and begins a new one.
+    """A loop in one process that starts with a flat mirror. Its record is the steps and truths since `new_record`.
 
     Attributes:
         config: configuration of the controller.
@@ -118,7 +118,7 @@ class Bench:
         self._status = Status(flat, self._mirror.apply(flat))
 
     def new_record(self) -> None:
-        """Begin a new record."""
+        """Discard steps and truths, and begin a new record."""
         self.steps: list[Step] = []
         self.truths: list[Truth] = []
 
@@ -204,7 +204,7 @@ class Bench:
         return np.array([getattr(truth, name).residual_nm for truth in self.truths], np.float64)
 
     def tilt_mas(self, last: int, *, continuous: bool = True) -> float:
-        """True tilt, mas rms per axis over the last frames: in continuous time, or at the starts of the exposures."""
+        """True tilt in the last frames, mas rms per axis: in continuous time, or at the starts of the exposures."""
         residual_nm = self.residual_nm(continuous=continuous)[-last:, :2]
         return float(np.sqrt(np.mean(residual_nm**2)) / self.nm_per_mas)
 
@@ -218,7 +218,7 @@ def timing_of(config: Configuration) -> Timing:
 def tuned(
     run: TimeSeries, config: Configuration, kinds: Sequence[str] = ("lqg",), timing: Timing | None = None
 ) -> dict[str, Tuned]:
-    """Laws of these kinds for pseudo-open-loop modes (frames, modes): all modes of the loop, or the first few."""
+    """Laws of these kinds, tuned from pseudo-open-loop modes (frames, modes): all of the loop, or its first few."""
     noll = config.noll[: run.values[0].shape[1]]
     rate_hz, leak = config.camera.rate_hz, np.zeros(len(noll))
     timing = timing_of(config) if timing is None else timing

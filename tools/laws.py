@@ -1,4 +1,4 @@
-"""Residual of every control law in the simulated loop, and its theory: the table of docs/howto/tuning.md."""
+"""Residual of every control law in the simulated loop, and in theory: two tables of docs/howto/tuning.md."""
 
 from typing import Any
 
@@ -51,7 +51,7 @@ def measure() -> Results:
 
 
 def case(config: Configuration) -> Results:
-    """Residual of the reaction wheel with each law, mas rms per axis, and its theory."""
+    """Residual of the reaction wheel under each law, mas rms per axis, in the simulated loop and in theory."""
     calibration = calibrated(config)
     bench = Bench(config, calibration)
     if config.camera.delay_frames > 1:
@@ -129,7 +129,7 @@ def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool
         robust: keep the margins that `lowfc tune` requires.
 
     Raises:
-        RuntimeError: the search ended at its bounds, which is no minimum.
+        RuntimeError: the search ended at one of its bounds, other than the highest corner; this is no minimum.
     """
     disturbance, timing = disturbance_of(config), timing_of(config)
     frequency_hz, variance_nm2 = variances_nm2(disturbance)
@@ -161,7 +161,7 @@ def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool
 
 
 def render(results: Results) -> str:
-    """A table with a row for each case and law, and one for LQG with a row for each case."""
+    """A table with a row for each case and law, and a table of LQG with a row for each case."""
     head = (
         *("sensor", "law", "residual tilt, mas rms per axis", "predicted from the log, mas"),
         *("in theory, mas: disturbance part, noise part", "gain margin", "phase margin, deg"),
@@ -185,12 +185,12 @@ def render(results: Results) -> str:
     return (
         f"{markdown(head, rows)}\n{markdown(lqg_head, map(_lqg_row, results['cases'].items()))}\nReaction wheel with "
         f"damped lines, 14 mas rms per axis, V = 0 unless stated, {RATE_HZ:g} Hz; the residual is the true tilt in "
-        "continuous time (8 samples in each frame); blurred sensor images through the live loop's own `advance`; laws "
-        f"identified from {IDENTIFY / RATE_HZ:g} s of the closed loop, measured over {MEASURE / RATE_HZ:g} s, "
-        f"{SETTLE / RATE_HZ:g} s after they were loaded. Exact lines: the residual of an LQG law with the exact "
+        "continuous time (8 samples in each frame). The live loop's own `advance` processes blurred sensor images. "
+        f"Laws are identified from {IDENTIFY / RATE_HZ:g} s of the closed loop and measured over {MEASURE / RATE_HZ:g} "
+        f"s, {SETTLE / RATE_HZ:g} s after they were loaded. Exact lines: the residual of an LQG law with the exact "
         "lines of the wheel, and a random walk behind a low-pass as drift. Theory: both parts of the first table, "
-        "added in quadrature; identified from 8 s: of a law from the first 8 s. Lines 2 % higher: the residual of the "
-        "LQG law when the lines have moved, and after identification from that run."
+        "added in quadrature; identified from 8 or 16 s: of laws from the last 8 or 16 s of these frames. Lines 2 % "
+        "higher: the residual of the LQG law when the lines have moved, and after identification from that run."
     )
 
 

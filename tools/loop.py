@@ -13,7 +13,7 @@ from tools.shared import Results, formatted_table, json_of
 
 LOOP = "lowfc sim-loop --disturbance reaction-wheel --star-magnitude 2 --sensor sam27d10_bal14 --duration 20"
 KEYS = {"disturbance.preset": "reaction-wheel", "star.magnitude": 2.0, "sensor.sam": "sam27d10_bal14"}
-"""The configuration behind `LOOP`."""
+"""Configuration keys with the same effect as the options of `LOOP`."""
 NORMAL = "[realtime]\npriority = 0\nlock_memory = false\ndisable_cpu_idle = false\n"
 RUNS = (
     ("250 Hz, SCHED_FIFO", 250, "", ""),
@@ -36,7 +36,7 @@ def measure() -> Results:
             file = Path(folder) / "run.toml"
             file.write_text(toml)
             run = json_of(f"{LOOP} --rate {rate_hz}{option} --config run.toml", folder) | {"log": None, "logs": []}
-            # One frame of delay, two if the command was late.
+            # Mean delay: one frame if the command was in time, two if it was late.
             delay = 1 + run["commands_late"] / run["frames_published"]
             config = load(file, KEYS | {"camera.rate_hz": float(rate_hz), "camera.delay_frames": delay})
             runs[name] = run | {"tilt_predicted_mas": round(tilt_residual_mas(config), 4)}
@@ -94,8 +94,8 @@ def render(results: Results) -> str:
         f"{formatted_table(LOOP_COLUMNS, rows)}\n"
         "The rate is by the host's clock. Frame to command "
         "ends when the controller's send returns; the mirror may have received the command before. The "
-        "prediction is for the disturbance's expected spectrum and the measured delay, without lost frames; a run is "
-        "one realisation."
+        "predicted residual is for the disturbance's expected spectrum and the measured delay, without lost frames; "
+        "each run has one realisation of the disturbance."
     )
 
 
@@ -163,7 +163,7 @@ RECORDER_COLUMNS = {
 
 
 def render_logs(results: Results) -> str:
-    """A row for each log, and one for each rate of messages to the recorder."""
+    """A table with a row for each log, and a table with a row for each frame rate at the recorder."""
     logs = (
         log | {"seconds": seconds, "log_mb": log["log_bytes"] / 1e6, "replay_mb": log["replay_bytes"] / 1e6}
         for seconds, log in results["logs"].items()
@@ -172,6 +172,6 @@ def render_logs(results: Results) -> str:
     return (
         f"{formatted_table(LOG_COLUMNS, logs)}\n{formatted_table(RECORDER_COLUMNS, rates)}\n"
         "Replay speed is relative to real time. The recorder's processor time is that of all its threads, as a "
-        "fraction of one processor; times to write and to flush are from a message's arrival until it is written, and "
-        "until it survives a kill."
+        "fraction of one processor. The times to write and to flush a message begin with its arrival; they end when it "
+        "is written, and when it would survive a kill -9 of the recorder."
     )

@@ -25,15 +25,15 @@ from tools.shared import ROOT
 
 PICTURES = ROOT / "docs" / "pictures"
 LOOK_S = 10.0
-"""Time from the start of a view to its picture; states change in the middle of it."""
+"""Time from the start of a view to its picture; the state of the run changes halfway."""
 MENU_BAR = 37  # pixels at the top without information on the loop
-SHADES = 192
+SHADES = 192  # colours of a stored picture
 BRIGHT = {"control.start_mode": "closed", "sensor.sam": "sam27d10_bal14"}
 SMALL_WELL = {"control.start_mode": "closed", "camera.full_well_e": 1500.0}
 
 
 def picture(name: str, source: str, *options: str, meanwhile: Callable[[], object] | None = None) -> None:
-    """Take a picture of a run or a log while `meanwhile` runs, and store it in the documentation."""
+    """Take a picture of a run or a log, and store it in the documentation; `meanwhile` runs before the picture."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / f"{name}.png"
         command = [sys.executable, "-m", "lowfc", "view", *source.split(), "--headless-screenshot", str(out), *options]
@@ -63,8 +63,8 @@ class PictureRun(ChaosBench):
         self.kill(Role.CAMERA)
         self.restart(Role.CAMERA, [*self.children[Role.CAMERA].command, "--config", str(file)], ready=False)
 
-    def stop_controller_repeatedly(self) -> None:
-        """Suspend the controller twelve times, for 40 ms each."""
+    def suspend_controller_repeatedly(self) -> None:
+        """Suspend the controller (SIGSTOP) twelve times, for 40 ms each."""
         for _ in range(12):
             with self.suspended(Role.CONTROLLER):
                 time.sleep(0.04)
@@ -79,7 +79,7 @@ def picture_run(keys: dict[str, Any]) -> Iterator[PictureRun]:
         run = PictureRun(config, Path(name), random.Random(1), None)  # noqa: S311  # nothing secret
         try:
             run.begin()
-            time.sleep(6)  # a starting loop skips some frames, and the tiles show that for five seconds
+            time.sleep(6)  # a starting loop skips some frames, which the tiles show for five seconds
             yield run
         finally:
             run.end()
@@ -94,7 +94,7 @@ def make() -> None:
         run.take_picture("open", meanwhile=loop.open_loop)
         loop.close_loop()
         time.sleep(5)
-        run.take_picture("frames-lost", meanwhile=run.stop_controller_repeatedly)
+        run.take_picture("frames-lost", meanwhile=run.suspend_controller_repeatedly)
         time.sleep(5)
         run.take_picture("recording-stopped", meanwhile=lambda: loop.record(False))
         picture("log", str(max(run.folder.glob("*.mcap"))))

@@ -23,8 +23,8 @@ CASES_FILE = ROOT / "tools" / "measured" / "chaos.json"
 _STALL = ("before", "during", "after")
 _PHASES = {
     "without": "not started",
-    "flooded and frozen": "flooded and stopped",
-    "frozen": "stopped",
+    "flooded and frozen": "flooded and suspended (SIGSTOP)",
+    "frozen": "suspended (SIGSTOP)",
     "flood without": "gone; flood continues",
 }
 """Phases of the case `console`, as the page names them."""
@@ -54,7 +54,7 @@ def measure_again(results: Results, seed: int, names: Sequence[str]) -> Results:
 
 
 def render_chaos(results: Results) -> str:
-    """A row for each case, over all seeds; latencies during stalls and with a console."""
+    """A table with a row for each case; tables of the latencies during stalls and with a console."""
     runs = results["runs"]
     all_cases = [case for run in runs for case in run["cases"]]
     by_name: dict[str, list[Results]] = {}
@@ -102,7 +102,7 @@ def render_chaos(results: Results) -> str:
 
 
 def _recovery(found: str) -> str:
-    """Residual before and after, from the finding of the rule `recovery`; release 0.1 wrote "safed"."""
+    """Residuals before and after a fault, from the text that the rule `recovery` found; release 0.1 wrote "safed"."""
     return found.removeprefix("residual ").split(" nm,")[0].replace("safed", "safe")
 
 
@@ -127,7 +127,7 @@ def _stalls(by_name: dict[str, list[Results]]) -> list[str]:
     rows = []
     for name, cases in by_name.items():
         for each in (case["figures"] for case in cases if name.startswith("stall-")):
-            if "p99_during_over_calm" in each:  # a case that failed early lacks some of the three spans
+            if "p99_during_over_calm" in each:  # a case that failed early lacks it
                 spans = ", ".join(f"{each['frame_to_command'][span]['p99_us']:.0f}" for span in _STALL)
                 rows.append((name.removeprefix("stall-"), spans, each["p99_during_over_calm"]))
     head = "stalled", "frame to command, p99, us: before, during, after", "during / mean of before and after"

@@ -68,8 +68,8 @@ def _keys(heading: str, about: str, section: type[Section], prefix: str) -> str:
         if isinstance(info.default, Section):
             continue
         default = "required" if info.is_required() else f"`{info.get_default(call_default_factory=True)!r}`"
-        kinds = (info.annotation, *get_args(info.annotation))  # a list or a union has further kinds
-        nested = [one for kind in kinds for one in get_args(kind)]
+        types = (info.annotation, *get_args(info.annotation))  # with those inside a list or a union
+        nested = [one for each in types for one in get_args(each)]
         bounds = [*info.metadata, *(bound for one in nested for bound in getattr(one, "metadata", ()))]
         values = [_bound(str(one)) for one in bounds if hasattr(one, "__dataclass_fields__")]
         values += [f"`{one}`" for one in nested if isinstance(one, str | int)]
@@ -85,7 +85,7 @@ def _bound(text: str) -> str:
 
 
 def topics() -> str:
-    """Every topic."""
+    """A table of all topics."""
     rows = []
     for topic in TOPICS:
         full = topic.message.DESCRIPTOR.full_name
@@ -112,7 +112,7 @@ def messages() -> str:
 
 @cache
 def json_objects() -> str:
-    """Every typed `--json` object."""
+    """Every `--json` object that has a class, with its fields."""
     for module in modules("lowfc.programs"):
         import_module(module)
     printed = {one for one in _subclasses(Result) if one.model_fields and one.__module__.startswith("lowfc.")}
@@ -148,7 +148,7 @@ def _subclasses(kind: type[Result]) -> set[type[Result]]:
 
 
 def former_names() -> str:
-    """The names of release 0.1 and their successors."""
+    """Every name that has changed since release 0.1, and the present name."""
     tables = {
         "configuration key": KEYS,
         "field of a message": FIELDS,

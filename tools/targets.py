@@ -1,4 +1,4 @@
-"""Targets of the fused step and of the loop around it, and the measured results."""
+"""Targets for latency and memory of the fused step and of its loop, and whether the measurements reach them."""
 
 from collections.abc import Callable, Iterator, Sequence
 from statistics import median
@@ -21,7 +21,7 @@ def render(measured: Callable[[str], Results]) -> str:
 
 
 def _row(quantity: str, limit: float, values: Sequence[float], form: str, bound: str, excess: str) -> Row:
-    """Row of a quantity with one value for each turn; `bound` of any such program; `excess`: work beyond the bound."""
+    """Row of a quantity with one value for each turn; `bound`: least value possible; `excess`: what takes the rest."""
     reached, shown = median(values), form.format
     spread = f" ({shown(min(values))} to {shown(max(values))})" if len(values) > 1 else ""
     met = "yes" if reached <= limit else "no"
@@ -47,12 +47,12 @@ def _comparison(results: Results) -> Iterator[Row]:
         ratios = [fused[at] / numpy[at] for fused, numpy in pairs(runs, NUMPY)]
         yield _row(f"frame to command, ratio fused / numpy, {at}", limit, ratios, "{:.2f}", shared, OBJECTS)
     sockets = "sockets wake two Python processes"
-    ways = f"{sockets}; the C chain waits on semaphores in shared memory"
+    links = f"{sockets}; the C chain waits on semaphores in shared memory"
     for other, targets in (("C chain", {"p50": 40.0, "p99": 80.0}), ("pyrtcao, fused", {"p50": 0.0, "p99": 0.0})):
         for at, limit in targets.items():
             differences = [fused[at] - compared[at] for fused, compared in pairs(runs, other)]
             quantity = f"frame to command, lowfc's fused step minus {other}, {at}, us"
-            excess = ways if other == "C chain" else f"{sockets}; also checks, limits and messages that pyrtcao lacks"
+            excess = links if other == "C chain" else f"{sockets}; also checks, limits and messages that pyrtcao lacks"
             yield _row(quantity, limit, differences, "{:+.0f}", "0 for the same work in C", excess)
 
 
