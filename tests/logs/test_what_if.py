@@ -180,9 +180,9 @@ class BetweenFramesLog(SyntheticLog):
     """A log with a delay of 1.5 frames: the mirror moves in the middle of each exposure."""
 
     def _publish(self, advanced: tuple[State, Outputs], late_ns: int = 0) -> None:
-        before_nm = self._to_modes @ np.ravel(self._state.loop.actuators_nm) if self._frames else self._moved_nm
+        before_nm = self._to_modes @ np.ravel(self._state.loop.actuators_nm) if self._frames else self._mirror_nm
         super()._publish(advanced, late_ns)
-        self._moved_nm = (before_nm + self._moved_nm) / 2
+        self._mirror_nm = (before_nm + self._mirror_nm) / 2
 
 
 def test_with_a_fractional_delay_the_continuous_residual_includes_the_motion_of_the_mirror(tmp_path: Path) -> None:

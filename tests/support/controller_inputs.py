@@ -27,7 +27,7 @@ _KINDS = (*["frame"] * 5, "bad", "late", "tick", "request", "mirror", "camera", 
 
 @st.composite
 def inputs(draw: st.DrawFn) -> list[Input]:
-    """Draw good and bad frames, gaps, ticks, requests, probe sequences, states of devices and bench values."""
+    """Draw good, bad and late frames, gaps, ticks, requests, probe sequences, device states and bench values."""
     drawn: list[Input] = []
     count = 0
     for kind in draw(st.lists(st.sampled_from(_KINDS), min_size=1, max_size=40)):

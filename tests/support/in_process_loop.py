@@ -1,4 +1,4 @@
-"""Loops in one process: one with the interface of `lowfc.client`, one in threads, one for a number of frames."""
+"""Loops in one process: with the interface of `lowfc.client`, for a number of frames, or in threads."""
 
 import contextlib
 import itertools
@@ -66,7 +66,7 @@ def calibration_of(toml: str) -> Calibration:
 
 
 class ReportingBus(MemoryBus):
-    """Connection of an operator's program; `report` is called at each subscription of a ring."""
+    """Connection of an operator's program; `report` is called whenever it subscribes with a ring buffer."""
 
     def __init__(self, hub: MemoryHub, report: Callable[[], object]) -> None:
         super().__init__(hub, "operator", HostClock())
@@ -96,7 +96,7 @@ class InProcessLoop(Client):
         lose: Callable[[int], bool] = lambda index: False,
         cut: int | None = None,
     ) -> None:
-        """Start a loop with `config`, in a simulated `world` that may differ; frames selected by `lose` do not arrive.
+        """Start a loop with `config` in a simulated `world`, by default the same; frames that `lose` selects are lost.
 
         With `cut`, frames lack that many pixels at each edge, and no calibration is computed.
         """
@@ -133,8 +133,8 @@ class InProcessLoop(Client):
         if not self.mirror_bus.closed:
             self._bench.move_mirror(frame, outputs.command)
             self._states.put(wire.MirrorState(frame_sequence=frame.sequence).SerializeToString())
-        for kind, waiting in self._listeners:
-            waiting.append(Image(frame.sequence, frame.time_ns, pixels) if kind == "frames" else outputs.step)
+        for kind, queue in self._listeners:
+            queue.append(Image(frame.sequence, frame.time_ns, pixels) if kind == "frames" else outputs.step)
 
     def silence_camera(self) -> None:
         """Let the frame timeout pass without a frame, and publish the events that the controller raises."""
@@ -147,7 +147,7 @@ class InProcessLoop(Client):
         self._bench.process_input(MirrorReport(0, fault))
 
     def residual_nm(self, first: int, last: int | None = None) -> npt.NDArray[np.float64]:
-        """True residual modes (frames, modes) in the exposures of the slice `first:last`."""
+        """True residual modes (frames, modes), nm rms, at the starts of the exposures in the slice `first:last`."""
         frames = range(len(self.surfaces_nm))[first:last]
         truths = [self.scene.truth(index, self.surfaces_nm[index]) for index in frames]
         return np.array([truth.sampled.residual_nm for truth in truths], np.float64)
@@ -222,16 +222,16 @@ class InProcessLoop(Client):
         return MirrorWatch(self._operator)
 
     def _listen(self, kind: str, count: int | None) -> Iterator[Any]:
-        waiting: deque[Any] = deque()
-        listener = (kind, waiting)
+        queue: deque[Any] = deque()
+        listener = (kind, queue)
         self._listeners.append(listener)
 
         def received() -> Iterator[Any]:
             try:
                 for _ in itertools.islice(itertools.count(), count):
-                    while not waiting:
+                    while not queue:
                         self.expose()
-                    yield waiting.popleft()
+                    yield queue.popleft()
             finally:
                 self._listeners = [one for one in self._listeners if one is not listener]
 
@@ -241,8 +241,8 @@ class InProcessLoop(Client):
 def run_loop(config: Configuration, frames: int, calibration: Calibration | None = None) -> SimpleNamespace:
     """Run the loop of a configuration; every frame must be used.
 
-    Returns error_nm, pol_nm and command_nm (frames, modes) of the steps, and disturbance_nm and residual_nm
-    (frames, modes), disturbance_rms_nm and residual_rms_nm (frames,) over the open pupil of the truth; nm.
+    Returns, in nm rms: error_nm, pol_nm, command_nm (frames, modes) of the steps; and of the truth disturbance_nm,
+    residual_nm (frames, modes), and over the open pupil disturbance_rms_nm, residual_rms_nm (frames,).
     """
     bench = Bench(config, calibration or calibrated(config))
     bench.run(frames)

@@ -35,7 +35,7 @@ start_mode = "closed"
 tilt_gain = 0.3
 gain = 0.3
 """
-"""Configuration of a bright star and a static wavefront of 8 nm tilt and 5 nm focus."""
+"""Configuration of a closed loop with a bright star and a static wavefront of 8 nm tilt x and 5 nm focus."""
 LOWFC = [sys.executable, "-m", "lowfc"]
 PROGRAMS = Path(sys.executable).parent
 FIXED = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
@@ -159,7 +159,7 @@ def command(folder: Path, line: str, timeout_s: float = 120, statuses: tuple[int
 
 @contextlib.contextmanager
 def in_background(folder: Path, *lines: str) -> Iterator[list[str]]:
-    """Run documented commands in the background, then stop them; the yielded list then has their standard errors."""
+    """Run documented commands in the background, then stop them; the list has their standard errors afterwards."""
     processes = [
         subprocess.Popen([PROGRAMS / program, *rest], cwd=folder, stderr=subprocess.PIPE, text=True)
         for program, *rest in map(shlex.split, lines)
@@ -194,7 +194,7 @@ def until(
 
 
 def socket_options(level: int, option: int) -> list[int]:
-    """Value of an option of each of this process's sockets that has it."""
+    """Values of a socket option, for those sockets of this process that have it."""
     found = []
     for descriptor in (int(path.name) for path in Path("/proc/self/fd").iterdir()):
         with contextlib.suppress(OSError):
@@ -207,5 +207,5 @@ def socket_options(level: int, option: int) -> list[int]:
 
 
 def recorded_bytes(folder: Path) -> int:
-    """Size of the log being written in a folder; more than 4 MB means that frames are recorded."""
+    """Size of the log that is being written in `folder`/logs; beyond 4 MB it contains frames."""
     return sum(path.stat().st_size for path in (folder / "logs").glob("*.part"))

@@ -1,4 +1,4 @@
-"""Randomly damaged bytes, messages and logs, reproducible from a generator or from a number."""
+"""Randomly damaged bytes, messages and logs, reproducible from a random generator or from the mutation's number."""
 
 import struct
 from collections.abc import Sequence
@@ -62,7 +62,7 @@ def small_log(path: Path, *, finished: bool = True) -> Path:
 
 
 def boundaries(data: bytes) -> list[int]:
-    """First byte of each record of a log, and the end of the last one."""
+    """Position of the first byte of each record in a log, and of the end of the last record."""
     starts = [len(MAGIC)]
     while starts[-1] + 9 <= len(data) - len(MAGIC) * data.endswith(MAGIC):  # an opcode and a length of eight bytes
         starts.append(starts[-1] + 9 + struct.unpack_from("<Q", data, starts[-1] + 1)[0])
@@ -70,7 +70,7 @@ def boundaries(data: bytes) -> list[int]:
 
 
 def chunks_of(path: Path) -> list[tuple[int, int]]:
-    """First byte and end of each chunk of a log."""
+    """Positions of the first byte and of the end of each chunk in a log."""
     starts = boundaries(data := path.read_bytes())
     return [(a, b) for a, b in pairwise(starts) if data[a] == Opcode.CHUNK]
 
@@ -91,7 +91,7 @@ def flipped(path: Path, position: int, bit: int = 0) -> Path:
 
 
 def mutated(data: bytes, number: int) -> tuple[str, bytes]:
-    """Kind of damage and content of mutation `number` of a log; never the log itself."""
+    """Kind of damage and content of mutation `number` of a log; the content always differs from the log."""
     rng = np.random.default_rng(number)
     starts = boundaries(data)
     records = [data[a:b] for a, b in pairwise(starts)]
@@ -113,8 +113,8 @@ def mutated(data: bytes, number: int) -> tuple[str, bytes]:
         case "cut":
             del changed[begin:]
         case "zeroed" | "random" | "inserted" | "deleted":
-            instead = {"zeroed": bytes(stop - begin), "random": noise, "inserted": noise + data[begin:stop]}
-            changed[begin:stop] = instead.get(kind, b"")
+            new = {"zeroed": bytes(stop - begin), "random": noise, "inserted": noise + data[begin:stop], "deleted": b""}
+            changed[begin:stop] = new[kind]
         case _:
             order = {
                 "shuffled": rng.permutation(len(records)),

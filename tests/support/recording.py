@@ -25,7 +25,7 @@ class Bench(Listener):
         self.folder = folder
         self.summary: Summary | None = None
         self.thread = threading.Thread(target=self._record, daemon=True)
-        self.cameras: list[wire.CameraState | None] = []  # settings that the recorder knew before its first log
+        self.cameras: list[wire.CameraState | None] = []  # camera states known when the first log began
         self.camera, self.controller = self.service("camera"), self.service("controller")
 
     def start(self, bytes_per_s: float = 0.0, **options: object) -> None:

@@ -69,7 +69,7 @@ class SyntheticLog:
         self._count = self._frames = 0
         self._to_modes = np.linalg.pinv(self.calibration.modes_to_actuators)
         self._dark_dn = self.calibration.dark.reshape(SHAPE).astype(float)
-        self._moved_nm = np.zeros(len(NOLL), np.float32)
+        self._mirror_nm = np.zeros(len(NOLL), np.float32)
         self.start_controller()
         camera = wire.CameraState(
             period_ns=PERIOD_NS,
@@ -82,7 +82,7 @@ class SyntheticLog:
         self.put(CAMERA_STATE, camera)
 
     def copy(self) -> Self:
-        """An independent log that continues this one."""
+        """An independent copy, which further messages can continue."""
         other = copy(self)
         other.samples, other._counts, other._rng = [*self.samples], {**self._counts}, deepcopy(self._rng)
         return other
@@ -94,7 +94,7 @@ class SyntheticLog:
         self.load(self.calibration)
 
     def load(self, calibration: Calibration) -> None:
-        """Load a calibration; the pixels remain those of the first calibration."""
+        """Load a calibration; the dark of the frames and the modes of the mirror remain those of the first one."""
         self.put(CALIBRATION, encode_calibration(calibration, self.now_ns))
         self._publish(advance(self.settings, self._state, Load(self.now_ns, calibration, "test")))
 
@@ -109,7 +109,7 @@ class SyntheticLog:
             sequence = sequence_of(self._camera_start, self._count)
             time_s = self._frames * PERIOD_NS * 1e-9
             wave_nm = np.array([12 * np.sin(2 * np.pi * 7 * time_s), 3.0, -2.0], np.float32)
-            residual_nm = wave_nm + self._moved_nm
+            residual_nm = wave_nm + self._mirror_nm
             frame = self._pixels(residual_nm, 0.0 if index in dark else FLUX_DN)
             self._count, self._frames = self._count + 1, self._frames + 1
             self.put(FRAME, image(frame, self.now_ns, "sensor"), sequence)
@@ -213,13 +213,13 @@ class SyntheticLog:
         return log.part
 
     def _publish(self, advanced: tuple[State, Outputs], late_ns: int = 0) -> None:
-        """Append the messages of the controller's outputs, and of the mirror that follows its command."""
+        """Append the messages of the controller's outputs, and the state of the mirror that follows its command."""
         self._state, outputs = advanced
         for event in outputs.events:
             self.event(event.name, **event.details)
         if outputs.command is not None:
             command = outputs.command
-            self._moved_nm = self._to_modes @ command.actuators_nm.ravel()
+            self._mirror_nm = self._to_modes @ command.actuators_nm.ravel()
             self.put(COMMAND, codec.encode_command(command, 10**9, "lowfc", self._state.input_number), late_ns=late_ns)
             state = wire.MirrorState(
                 frame_sequence=command.frame_sequence,
@@ -243,7 +243,7 @@ class SyntheticLog:
             self.put(CONTROLLER_STATE, state_now, late_ns=late_ns)
 
     def _pixels(self, residual_nm: Single, flux_dn: float) -> Pixels:
-        """Draw photon and read noise."""
+        """Pixels (rows, columns) of a residual (modes,), with photon and read noise."""
         electrons = self._rng.poisson(TOY.pixels(residual_nm, flux_dn) - self._dark_dn)
         drawn = self._dark_dn + electrons + READ_NOISE_E * self._rng.standard_normal(SHAPE)
         return np.asarray(np.rint(np.clip(drawn, 0, 65_535)), np.uint16)

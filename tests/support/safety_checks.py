@@ -1,4 +1,4 @@
-"""Checks of the actuator limits, with hand-chosen cases, and the simulated mirror behind its protection."""
+"""Checks of the actuator limits, hand-chosen cases for them, and the simulated mirror behind its protection."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -61,7 +61,7 @@ CASES = (
         "neighbours, signs reversed", rows(-190, 190, 190), rows(-230, 230, 230), ("NEIGHBOUR",), rows(-200, 200, 200)
     ),
     Case("neighbours crossing over", rows(60, -60, 0), rows(-45, 45, 0), ("SLEW",), rows(-40, 40, 0)),
-    Case("all neighbours together", rows(500, 500, 500), rows(550, 550, 550), (), rows(550, 550, 550)),
+    Case("all actuators together", rows(500, 500, 500), rows(550, 550, 550), (), rows(550, 550, 550)),
     Case(
         "clipped at the neighbour limit",
         rows(0, 0, 0),
@@ -93,10 +93,10 @@ CASES = (
     Case("beyond the slew", rows(3, 3, 3), rows(103.01, 3, 3), ("SLEW",), rows(103, 3, 3)),
     Case("within the stroke", rows(650, 650, 650), rows(699.99, 650, 650), (), rows(699.99, 650, 650)),
     Case("beyond the stroke down", rows(-650, -650, -650), rows(-700.01, -650, -650), ("STROKE",)),
-    Case("within neighbours in a column", rows(170, -170, -170), rows(199.99, -200, -200), ()),
-    Case("within neighbours in a row", columns(170, -170, -170), columns(199.99, -200, -200), ()),
-    Case("beyond neighbours in a column", rows(170, -170, -170), rows(200.01, -200, -200), ("NEIGHBOUR",)),
-    Case("beyond neighbours in a row", columns(170, -170, -170), columns(200.01, -200, -200), ("NEIGHBOUR",)),
+    Case("within the neighbour limit in a column", rows(170, -170, -170), rows(199.99, -200, -200), ()),
+    Case("within the neighbour limit in a row", columns(170, -170, -170), columns(199.99, -200, -200), ()),
+    Case("beyond the neighbour limit in a column", rows(170, -170, -170), rows(200.01, -200, -200), ("NEIGHBOUR",)),
+    Case("beyond the neighbour limit in a row", columns(170, -170, -170), columns(200.01, -200, -200), ("NEIGHBOUR",)),
     Case("at the neighbour limit", rows(195, -195, 0), rows(200, -200, 0), ("NEIGHBOUR",), rows(200, -200, 0)),
 )
 
@@ -123,10 +123,10 @@ def check_case(limit: Callable[[Limits, Single, Single], Limited], case: Case) -
     for _ in range(case.steps):
         limited = limit(LIMITS, shape, case.commanded_nm)
         after: Single = limited.actuators_nm
-        broken = violations(LIMITS, shape, after)
+        violated = violations(LIMITS, shape, after)
         if outside:
-            broken = [one for one in broken if one.startswith(("slew", "finite"))]
-        assert broken == [], f"{case.name}: {broken}"
+            violated = [one for one in violated if one.startswith(("slew", "finite"))]
+        assert violated == [], f"{case.name}: {violated}"
         shape = after
     names = tuple(reason.name for reason in limited.reasons)
     assert names == case.reasons, f"{case.name}: {names}"

@@ -1,4 +1,4 @@
-"""Fuzzing targets: readers of external data, each with valid inputs to start from and its permitted errors."""
+"""Fuzzing targets: readers of external data, each with valid inputs to mutate and the errors that it may raise."""
 
 import json
 import tempfile
@@ -65,7 +65,7 @@ class Target:
         read: reads an input; may raise only `errors`.
         errors: permitted exceptions.
         message: class of the inputs if they are protobuf messages.
-        cost: approximate duration of an input relative to a message.
+        cost: approximate time to read an input, relative to a message.
     """
 
     name: str
@@ -76,7 +76,7 @@ class Target:
     cost: int = 1
 
     def input(self, number: int) -> bytes:
-        """Input `number`; it depends only on this number and the target."""
+        """Mutated input `number`, which depends only on this number and the target."""
         rng = Random(f"{self.name} {number}")  # noqa: S311
         data = rng.choice(self.corpus)
         if self.message is not None and rng.random() < 0.5:
@@ -159,7 +159,7 @@ class Processes:
         self.commands.put(data)
         self._run_once()
 
-    def settings(self, data: bytes) -> None:
+    def camera_state(self, data: bytes) -> None:
         self.camera_states.put(data)
         self._run_once()
 
@@ -197,7 +197,7 @@ def _messages() -> list[Target]:
         Target("frame", (ENVELOPE + frame_bytes,), loop.frame, (LowfcError,), cost=3),
         Target("camera to controller", (frame_bytes,), processes.frame, message=codec.RawImage, cost=10),
         Target("controller to mirror", (command_bytes,), processes.command, message=wire.MirrorCommand, cost=10),
-        Target("camera's settings", (camera_bytes,), processes.settings, message=wire.CameraState, cost=10),
+        Target("camera's settings", (camera_bytes,), processes.camera_state, message=wire.CameraState, cost=10),
         Target("mirror state", (mirror_bytes,), loop.mirror_state, (LowfcError,), wire.MirrorState),
         Target("camera state", (camera_bytes,), loop.camera_state, (LowfcError,), wire.CameraState),
         Target(
@@ -269,7 +269,7 @@ def _apply_to_mirror(data: bytes) -> None:
 
 
 def _show(data: bytes) -> None:
-    """Pass a message to the viewer as each displayed topic."""
+    """Pass a message to the viewer once on each topic that it displays."""
     accumulator = Accumulator()
     for topic in SHOWN:
         accumulator.add(Sample(topic.at("dm"), data, 0, 1, 1))
@@ -340,7 +340,7 @@ def _logs(folder: Path) -> list[Target]:
     log = SyntheticLog().frames(30).request("gain", (0.3,)).frames(20)
     loop_log = (log.write(folder / "run.mcap").read_bytes(),)
 
-    def recovered(path: Path) -> None:
+    def recover_log(path: Path) -> None:
         with tempfile.TemporaryDirectory(dir=folder) as out:
             recover(path, Path(out) / "out.mcap")
 
@@ -348,5 +348,5 @@ def _logs(folder: Path) -> list[Target]:
     return [
         _file_target("log, read", small_logs, lambda path: list(LogReader(path, skip_damaged=True)), path, 300),
         _file_target("log, its history", loop_log, lambda path: read_history(LogReader(path)), path, 300),
-        _file_target("log, recovered", small_logs, recovered, path, 600),
+        _file_target("log, recovered", small_logs, recover_log, path, 600),
     ]

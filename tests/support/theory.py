@@ -1,4 +1,4 @@
-"""Laws for tests, loops that run them, and a theory of the integrator independent of `lowfc.control.laws.margins`."""
+"""Laws for tests, a loop that runs them, and a theory of the integrator apart from `lowfc.control.laws.margins`."""
 
 from collections.abc import Iterable
 
@@ -27,7 +27,7 @@ from sim_camera.disturbance import Disturbance, Sampler
 def law_of(
     gain: npt.ArrayLike = 0.5, leak: npt.ArrayLike = 0.0, limit_nm: npt.ArrayLike = 1000.0, modes: int = 3
 ) -> Integrator:
-    """Make an integrator with one gain for all modes, or one for each."""
+    """An integrator; gain, leak and limit are each one value for all modes, or one for each mode."""
     return Integrator(*(np.broadcast_to(np.asarray(each, np.float32), (modes,)) for each in (gain, leak, limit_nm)))
 
 
@@ -39,7 +39,7 @@ def linear(
 
 
 def one_piece(values: Array) -> TimeSeries:
-    """A time series (frames, modes) without gaps."""
+    """The values (frames, modes) as a time series without gaps."""
     return TimeSeries((values,), 0)
 
 
@@ -67,7 +67,7 @@ def integrators(modes: Iterable[tuple[float, float]], signal: Signal, delay_fram
 
 
 def run(law: LinearLaw, disturbance_nm: Array, delay_frames: float, limit_nm: float = np.inf) -> tuple[Array, Array]:
-    """Errors and commands (frames, modes) of a loop without noise; its delay may differ from the law's."""
+    """Errors and commands (frames, modes), nm, of a loop without noise; its delay may differ from the law's."""
     weights = delay_weights(delay_frames).astype(np.float32)
     assumed = delay_weights(law.delay_frames).astype(np.float32)
     history = np.zeros((max(len(weights), len(assumed)), disturbance_nm.shape[1]), np.float32)
@@ -84,7 +84,7 @@ def run(law: LinearLaw, disturbance_nm: Array, delay_frames: float, limit_nm: fl
 
 
 def realised(model: Model, frames: int, seed: int = 0) -> Array:
-    """Realisation (frames, 1) of a model's disturbance plus its noise."""
+    """Realisation (frames, 1), nm, of a model's disturbance plus its measurement noise."""
     rng = np.random.default_rng(seed)
     F, Q, C = model.states()
     root = np.linalg.svd(Q)
@@ -96,7 +96,7 @@ def realised(model: Model, frames: int, seed: int = 0) -> Array:
 
 
 def modes_nm(disturbance: Disturbance, first: int, count: int, rate_hz: float) -> Array:
-    """Modes (count, modes) of a disturbance at the starts of the exposures of the frames from `first` on."""
+    """Modes (count, modes) of a disturbance, nm rms, at the starts of the exposures of frames from `first` on."""
     sampler = Sampler(disturbance, np.zeros(1), rate_hz)
     return np.array([sampler.at(index)[0] for index in range(first, first + count)], np.float64)
 

@@ -28,7 +28,7 @@ def frame_sequence(count: int, start: int = START) -> int:
 
 
 class Toy:
-    """I0 (pixels,) and H (pixels, modes) before normalisation, and the modes' shapes on the mirror."""
+    """Reference image (pixels,) and response (pixels, modes) before normalisation, and modes to actuators."""
 
     def __init__(self) -> None:
         rng = np.random.default_rng(11)
@@ -115,7 +115,7 @@ def feed(settings: Settings, state: State, *inputs: Input) -> tuple[State, list[
 
 
 def running(setup: Settings | None = None, frames: int = 5) -> State:
-    """State of a closed loop after frames of one wavefront; the mirror is not flat."""
+    """State of a closed loop after frames of the wavefront `WAVE_NM`; the mirror is not flat."""
     setup = setup or settings()
     return feed(setup, loaded(setup), *(frame(count, WAVE_NM) for count in range(1, frames + 1)))[0]
 

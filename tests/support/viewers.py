@@ -37,7 +37,7 @@ needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no browser is inst
 
 
 def on_screen(test: Callable[..., None]) -> Callable[..., None]:
-    """Mark a test of rerun's drawing: it needs a Vulkan driver, and runs exclusively."""
+    """Mark a test that lets rerun draw: it needs a Vulkan driver, and runs exclusively."""
     return pytest.mark.exclusive(pytest.mark.viewer(needs_vulkan(test)))
 
 
@@ -51,7 +51,7 @@ def pixels(png: bytes) -> Pixels:
 
 
 def share_of(picture: Pixels, colour: tuple[int, int, int]) -> float:
-    """Fraction of the pixels within 12 of 255 of a colour in each channel, 0 to 1."""
+    """Fraction of the pixels, 0 to 1, of which each channel differs from a colour by at most 12 of 255."""
     return float(np.all(np.abs(picture.astype(int) - colour) <= 12, axis=2).mean())
 
 
@@ -131,7 +131,7 @@ class Page:
 
 @contextlib.contextmanager
 def browser(folder: Path, size_px: tuple[int, int], *, webgl: bool = False) -> Iterator[Page]:
-    """Run a headless Chromium that reaches this host only; with `webgl` it draws in software, which is slow."""
+    """Run a headless Chromium that can connect to this host only; `webgl` is drawn in software, which is slow."""
     quiet = ("quic", "background-networking", "component-update", "sync", "default-apps", "extensions", "dev-shm-usage")
     options = ["headless", "no-sandbox", "no-first-run", "hide-scrollbars", "remote-debugging-port=0"]
     drawing = ("use-angle=swiftshader", "enable-unsafe-swiftshader", "ignore-gpu-blocklist")

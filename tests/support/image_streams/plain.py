@@ -1,4 +1,4 @@
-"""Independent reader and writer of ImageStreamIO streams from the published layout, without code of the product.
+"""Reader and writer of ImageStreamIO streams after the published layout, independent of the code of lowfc.
 
 Byte offsets are explicit, packed and unpacked with `struct`.
 """
@@ -62,12 +62,12 @@ class PlainStream:
         itemsize = np.dtype(NUMPY_TYPES.get(pixel_type, "f8")).itemsize
         elements = columns * rows * planes
         length = (elements * itemsize + 7) // 8 * 8
-        # A circular buffer also has times and a counter of each plane.
-        ring_times = planes * 40 if kind & 0xF000F == 0x20001 else 0
+        # A circular buffer also has the times and a counter of each plane.
+        ring_bytes = planes * 40 if kind & 0xF000F == 0x20001 else 0
         path.unlink(missing_ok=True)
         with path.open("wb") as file:
             os.fchmod(file.fileno(), 0o666)
-            tail = KEYWORD * len(keyword_values) + 11 * SEMAPHORE + 4 * 40 + 10 * TRACE + ring_times
+            tail = KEYWORD * len(keyword_values) + 11 * SEMAPHORE + 4 * 40 + 10 * TRACE + ring_bytes
             file.truncate(header_bytes + length + tail)
         stream = cls(path, columns, rows, pixel_type if pixel_type in NUMPY_TYPES else 10, planes, len(keyword_values))
         stream.pack("80s", 32, path.name.removesuffix(".im.shm").encode())
@@ -117,7 +117,7 @@ class PlainStream:
         return flat.reshape(self.shape)
 
     def begin(self, image: npt.NDArray[np.generic], plane: int = 0) -> None:
-        """Begin to write an image: set the flag, write the pixels."""
+        """Begin to write an image: set the write flag, write the pixels and the number of their plane."""
         self.pack("B", 288, 1)  # write flag
         raw = np.ascontiguousarray(image, self.type).tobytes()
         offset = self.data + plane * len(raw)
@@ -125,7 +125,7 @@ class PlainStream:
         self.pack("<Q", 272, plane)  # cnt1
 
     def end(self, acquired_ns: int | None = None) -> None:
-        """Finish the image: times, counter, flag, and post the semaphores whose value is below ten."""
+        """Finish the image: write times and counter, clear the write flag, post semaphores of a value below ten."""
         now_ns = time.clock_gettime_ns(time.CLOCK_TAI)
         self.pack("<qq", 184, *divmod(now_ns if acquired_ns is None else acquired_ns, 10**9))
         self.pack("<qq", 200, *divmod(now_ns, 10**9))
@@ -145,6 +145,6 @@ class PlainStream:
         self.pack("<i", self.readers + 4 * index, os.getpid() if pid is None else pid)
 
     def wait(self, index: int, timeout_s: float) -> bool:
-        """Wait for a semaphore; return whether it was posted."""
+        """Wait for a semaphore; return whether it was posted before the timeout."""
         end = struct.pack("@ll", *divmod(time.time_ns() + int(timeout_s * 1e9), 10**9))
         return LIBC.sem_timedwait(self.semaphore(index), ctypes.c_char_p(end)) == 0
