@@ -1,4 +1,4 @@
-"""Errors of the simulated mirror's actuators, against simple models."""
+"""Errors of the simulated mirror's actuators, compared with simple models."""
 
 import numpy as np
 import pytest
@@ -25,31 +25,31 @@ def test_gain_errors_differ_between_actuators_and_depend_on_the_seed() -> None:
     assert np.abs(gains[0] - gains[2]).max() > 0.05
 
 
-def play(width_nm: float, heights_nm: list[float]) -> list[float]:
-    """Play operator: a block in a slot, which moves only when an end of the slot pushes it."""
+def play(half_width_nm: float, heights_nm: list[float]) -> list[float]:
+    """Play operator: positions of a block in a slot that moves to these heights and pushes the block with its ends."""
     positions_nm, position_nm = [], 0.0
     for height_nm in heights_nm:
-        if height_nm - position_nm > width_nm:
-            position_nm = height_nm - width_nm
-        elif position_nm - height_nm > width_nm:
-            position_nm = height_nm + width_nm
+        if height_nm - position_nm > half_width_nm:
+            position_nm = height_nm - half_width_nm
+        elif position_nm - height_nm > half_width_nm:
+            position_nm = height_nm + half_width_nm
         positions_nm.append(position_nm)
     return positions_nm
 
 
 def test_hysteresis_agrees_with_play_operators_and_encloses_their_area() -> None:
-    """The hysteresis loop of a play of half width r for a swing of +-A has the area 4 r (A - r)."""
+    """The hysteresis loop of a play operator of half width r has the area 4 r (A - r) for a swing of +-A."""
     swing_nm, hysteresis = 80.0, 0.1
     cycle = swing_nm * np.sin(np.linspace(0, 2 * np.pi, 4001))
     heights = [*cycle, *cycle[1:]]
     actuators = Actuators(GRID, 0, hysteresis, 0, 1)
     reached = [float(actuators.reach(uniform(height), AT_ONCE)[0, 0]) for height in heights]
-    plays = np.mean([play(width, heights) for width in PLAY_NM], axis=0)
-    np.testing.assert_allclose(reached, (1 - hysteresis) * np.array(heights) + hysteresis * plays, atol=1e-3)
-    # The second of the two cycles; the first begins inside the loop.
+    played = np.mean([play(half_width, heights) for half_width in PLAY_NM], axis=0)
+    np.testing.assert_allclose(reached, (1 - hysteresis) * np.array(heights) + hysteresis * played, atol=1e-3)
+    # The second of the two cycles; the first begins inside the hysteresis loop.
     commanded_nm, reached_nm = np.array(heights[4000:]), np.array(reached[4000:])
     area = abs(np.sum((reached_nm[1:] + reached_nm[:-1]) / 2 * np.diff(commanded_nm)))
-    expected = hysteresis * np.mean([4 * width * max(swing_nm - width, 0) for width in PLAY_NM])
+    expected = hysteresis * np.mean([4 * half_width * max(swing_nm - half_width, 0) for half_width in PLAY_NM])
     assert area == pytest.approx(expected, rel=0.01)
 
 

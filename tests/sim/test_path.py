@@ -1,4 +1,4 @@
-"""Shape of the simulated mirror within a period: times of its commands, and settling."""
+"""Shape of the simulated mirror within a frame period: times of its commands, and settling; times are in periods."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def heights(path: MirrorPath, start: float) -> list[float]:
     return (weights @ np.array(shapes)[:, 0, 0]).tolist()
 
 
-def test_shape_applies_from_its_time_on() -> None:
+def test_a_shape_is_in_effect_from_its_time_on() -> None:
     path = MirrorPath(FLAT)
     assert heights(path, 0) == [0, 0, 0]
     path.applied(1.0, ONE)
@@ -54,7 +54,7 @@ def test_instants_long_before_a_shape_do_not_overflow() -> None:
 
 
 @pytest.mark.parametrize("settling", [0.1, 300.0])
-def test_number_of_shapes_is_bounded(settling: float) -> None:
+def test_number_of_stored_shapes_is_bounded(settling: float) -> None:
     path = MirrorPath(FLAT, settling=settling)
     for moment in range(1000):
         path.applied(moment, ONE)
@@ -64,7 +64,7 @@ def test_number_of_shapes_is_bounded(settling: float) -> None:
 
 
 def test_a_shape_with_an_earlier_time_than_the_previous_shape_applies_at_the_previous_time() -> None:
-    """This happens after a stall of the host, when frames restart: the weights of the shapes still sum to 1."""
+    """Such a time comes after a stall of the host, when frames restart; the weights of the shapes still sum to 1."""
     path = MirrorPath(FLAT, settling=0.001)
     for moment, shape in ((0.7, ONE), (0.2, TWO), (0.75, ONE)):
         path.applied(moment, shape)

@@ -1,4 +1,4 @@
-"""Pixel errors of the simulated detector, against simple models."""
+"""Pixel errors of the simulated detector, compared with simple models."""
 
 from functools import partial
 
@@ -15,24 +15,24 @@ from tests.support.in_process_loop import configuration
 
 FLAT = np.zeros((34, 34), np.float32)
 DETECTOR = Detector(full_well_e=40_000.0, bias_dn=100.0)
-quiet = partial(configuration, {"disturbance.preset": "quiet", "star.magnitude": 20.0})
+faint = partial(configuration, {"disturbance.preset": "quiet", "star.magnitude": 20.0})
 
 
 def test_dark_current_has_a_poisson_distribution() -> None:
     """400 electrons per second in 2 ms: digital numbers have a Poisson distribution with mean 0.8."""
-    config = quiet(camera__dark_current_e_s=400.0, camera__read_noise_e=0.0)
+    config = faint(camera__dark_current_e_s=400.0, camera__read_noise_e=0.0)
     assert config.dark_e == pytest.approx(0.8)
     frame = expose(detector(config), np.zeros((400, 500)), np.random.default_rng(1))
     counted = np.bincount((frame - 100).ravel(), minlength=8)
     expected = scipy.stats.poisson.pmf(np.arange(8), 0.8) * frame.size
-    often = expected > 5
-    observed = [*counted[often], counted[~often].sum()]
-    p_value = scipy.stats.chisquare(observed, [*expected[often], frame.size - expected[often].sum()])[1]
+    frequent = expected > 5
+    observed = [*counted[frequent], counted[~frequent].sum()]
+    p_value = scipy.stats.chisquare(observed, [*expected[frequent], frame.size - expected[frequent].sum()])[1]
     assert p_value > 1e-3
 
 
 def test_dark_current_raises_the_mean_of_frames() -> None:
-    frames = [scene(quiet(camera__dark_current_e_s=rate)).expose(0, FLAT) for rate in (0.0, 5000.0)]
+    frames = [scene(faint(camera__dark_current_e_s=rate)).expose(0, FLAT) for rate in (0.0, 5000.0)]
     assert frames[1].mean() - frames[0].mean() == pytest.approx(10, abs=0.2)
 
 
@@ -51,8 +51,8 @@ def test_hot_pixels_and_gains_have_the_configured_statistics() -> None:
 def test_nonlinear_response_is_exact_at_zero_and_full_well() -> None:
     found, full = response(DETECTOR, 0.05), saturation_dn(DETECTOR)
     assert found[[0, 50, 100, full]].tolist() == [0, 50, 100, full]
-    for signal in (200, 20_000, 35_000):
-        assert found[100 + signal] - 100 == pytest.approx(signal * 1.05 - 0.05 * signal**2 / 40_000, abs=0.5)
+    for light_dn in (200, 20_000, 35_000):
+        assert found[100 + light_dn] - 100 == pytest.approx(light_dn * 1.05 - 0.05 * light_dn**2 / 40_000, abs=0.5)
     assert (np.diff(found[: full + 1].astype(int)) >= 0).all()
     np.testing.assert_array_equal(response(DETECTOR, 0.0), np.arange(1 << 16))
 

@@ -1,4 +1,4 @@
-"""The mirror's own protection, on the simulated mirror: limits, command timeout and checks hold for any commands."""
+"""The mirror's own protection, with the simulated mirror: limits, command timeout, and checks of commands."""
 
 import numpy as np
 import pytest
@@ -52,7 +52,7 @@ def test_clear_id_resets_the_newest_sequence_of_the_mirror() -> None:
     status, refused = device.apply_command(status, command(uniform(9.0), 3, clear_id=77), START_NS)
     assert (refused, status.frame_sequence) == (None, 3)
     _, refused = device.apply_command(status, command(uniform(9.0), 2, clear_id=77), START_NS)
-    assert refused is Rejection.OUT_OF_ORDER, "a clear_id resets the sequence only once"
+    assert refused is Rejection.OUT_OF_ORDER, "the same clear_id resets the sequence only once"
     assert device.apply_command(status, command(uniform(9.0), 2, clear_id=78), START_NS)[1] is None
 
 
@@ -67,7 +67,7 @@ def test_mirror_accepts_sixteen_channels() -> None:
     assert device.apply_command(device.initial, command(uniform(1.0), channel="x" * 33), START_NS)[1] is Limit.CHANNEL
 
 
-def test_safe_mode_is_stored_by_channel() -> None:
+def test_safe_mode_is_stored_for_each_channel() -> None:
     device = mirror()
     status, _ = device.apply_command(device.initial, command(uniform(1.0), safe=True), START_NS)
     status, _ = device.apply_command(status, command(uniform(1.0), channel="other"), START_NS)
@@ -104,7 +104,7 @@ commands = st.lists(
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(script=commands, bits=st.sampled_from([8, 10, 16, 24]))
 def test_surface_stays_within_the_limits_for_any_commands(script: list[object], bits: int) -> None:
-    """This holds also after rounding to the driver's steps, and when the command has expired."""
+    """The limits hold also after rounding to the driver's steps, and when the command has expired."""
     device = mirror(driver_bits=bits)
     status, now_ns = device.initial, START_NS
     for index, entry in enumerate(script):
@@ -131,7 +131,7 @@ def test_a_command_is_rounded_to_the_drivers_steps(bits: int) -> None:
 
 
 def test_mirror_at_the_neighbour_limit_does_not_oscillate() -> None:
-    """Rounding must not exceed the limit by itself, which would make the mirror fall back towards flat."""
+    """Rounding to the driver's steps must not exceed the limit; the mirror would then fall back towards flat."""
     device = mirror(driver_bits=8)
     shape_nm = uniform(0)
     shape_nm[:2] = 740
@@ -288,7 +288,7 @@ def test_command_with_an_older_time_does_not_move_the_surface_back() -> None:
     assert np.array_equal(unmoved.surface_nm, status.surface_nm)
 
 
-def test_commands_of_the_same_frame_move_the_surface_within_the_slew() -> None:
+def test_commands_of_the_same_frame_move_the_surface_within_the_slew_limit() -> None:
     """After a frame timeout, the controller relaxes the mirror with commands that all have the last frame's time."""
     device = mirror(settling_us=1000.0)
     status = follow(device, device.initial, 100, 200, 300)

@@ -1,4 +1,4 @@
-"""Reaction wheels, drift, jitter and shear of the simulated camera, against simple models."""
+"""Reaction wheels, drift, jitter and shear of the simulated camera, compared with simple models."""
 
 from dataclasses import replace
 from functools import partial
@@ -38,21 +38,21 @@ def wheel(course: str, change: float) -> Wheel:
     ],
 )
 def test_phase_of_wheel_harmonics_is_the_integral_of_the_speed(course: str, change: float, speed_hz: Any) -> None:
-    """Compared with a numerically integrated phase; a ramp passes through zero speed, where the amplitude vanishes."""
+    """Expected: a numerically integrated phase. The falling ramp passes zero speed, where the amplitude vanishes."""
     spinning, speed = wheel(course, change), speed_hz(TIME_S)
     phase = 2 * np.pi * cumulative_trapezoid(speed, TIME_S, initial=0)
     expected = np.zeros((TIME_S.size, 2))
     for order, amplitude_nm in zip(ORDERS, spinning.amplitude_nm, strict=True):
-        height = (order * speed) ** 2 / ((order * speed) ** 2 + SOFT_HZ**2)
-        expected += (height * np.exp(1j * order * phase))[:, None].real * amplitude_nm.real
-        expected -= (height * np.exp(1j * order * phase))[:, None].imag * amplitude_nm.imag
+        relative = (order * speed) ** 2 / ((order * speed) ** 2 + SOFT_HZ**2)  # amplitude relative to high speed
+        expected += (relative * np.exp(1j * order * phase))[:, None].real * amplitude_nm.real
+        expected -= (relative * np.exp(1j * order * phase))[:, None].imag * amplitude_nm.imag
     np.testing.assert_allclose(spinning.speed_hz(TIME_S), speed, atol=1e-9)
     np.testing.assert_allclose(spinning.modes_nm(TIME_S), expected, atol=2e-3)
     np.testing.assert_allclose(np.abs(spinning.amplitude_nm[0]) / np.sqrt(2), [2.0, 3.0])
     assert np.abs(spinning.amplitude_nm[:, 0] / spinning.amplitude_nm[0, 0]) == pytest.approx(HEIGHTS)
 
 
-def test_phase_of_a_wheel_whose_speed_wanders_is_the_integral_of_the_speed() -> None:
+def test_phase_of_a_wheel_with_random_walk_of_its_speed_is_the_integral_of_the_speed() -> None:
     spinning, time_s = wheel("walk", 0.5), TIME_S[::10]
     speed = spinning.speed_hz(time_s)
     assert speed[0] == pytest.approx(30)
@@ -90,8 +90,8 @@ def test_a_wheel_that_would_not_run_down_is_refused(wrong: dict[str, float]) -> 
         quiet(**{f"disturbance__{key}": value for key, value in keys.items()})
 
 
-def test_two_wheels_beat() -> None:
-    """The amplitude of the sum of two equal harmonics beats at the speed difference, between zero and twice theirs."""
+def test_harmonics_of_two_wheels_beat() -> None:
+    """The sum of two equal harmonics beats at the speed difference: its amplitude is up to twice that of one."""
     one, other = wheels(1, (30.0, 30.5), np.array([2.0]))
     time_s = np.arange(0, 4, 1e-3)
     both = [replace(each, amplitude_nm=np.array([[2.0], *[[0]] * 4]) + 0j) for each in (one, other)]
@@ -114,9 +114,9 @@ def test_sensor_sees_the_mean_of_fast_jitter_over_the_exposure(exposure: float) 
     )
     simulated, samples = scene(config), 2000  # samples per frame period
     for index in (0, 7, 8, 30):
-        within = modes_nm(disturbance, index * samples, round(exposure * samples) + 1, 1000.0 * samples)
-        mean = (within[1:] + within[:-1]).mean(axis=0) / 2
-        assert np.abs(simulated.truth(index, FLAT).sensed_nm - mean)[:2].max() < 0.1
+        exposed_nm = modes_nm(disturbance, index * samples, round(exposure * samples) + 1, 1000.0 * samples)
+        mean_nm = (exposed_nm[1:] + exposed_nm[:-1]).mean(axis=0) / 2
+        assert np.abs(simulated.truth(index, FLAT).sensed_nm - mean_nm)[:2].max() < 0.1
 
 
 def test_shear_changes_the_image_but_not_the_wavefront() -> None:
