@@ -1,4 +1,4 @@
-"""What-ifs of logs, compared with runs with the same gains, and errors in the options."""
+"""What-ifs of logs, compared with runs that had the same gains, their warnings, and errors in their options."""
 
 import json
 import re
@@ -43,7 +43,7 @@ RATE_HZ = 250
 Gains = tuple[float, float, float]
 """Gain of both tilts and gain of the other modes, as fractions of the highest stable gain; leak of all modes."""
 
-HARD, SOFT, LEAKY = (0.45, 0.03, 0.0), (0.1, 0.35, 0.0), (0.5, 0.02, 0.03)
+HIGH_TILT_GAIN, LOW_TILT_GAIN, LEAKY = (0.45, 0.03, 0.0), (0.1, 0.35, 0.0), (0.5, 0.02, 0.03)
 
 
 def configured(gains: Gains, delay: float, **overrides: object) -> Configuration:
@@ -68,7 +68,7 @@ def settled_rms(values: np.ndarray) -> np.ndarray:
 
 
 def predicted_errors(run: SimpleNamespace, config: Configuration) -> np.ndarray:
-    """Errors (frames, modes) of the run under the law of another configuration."""
+    """Modal errors (frames, modes), nm, that the run would have had with the gains and leaks of a configuration."""
     settings = factory.settings(config)
     weights = delay_weights(settings.delay_frames).astype(np.float32)
     pol_nm = run.pol_nm.astype(np.float32)
@@ -82,18 +82,18 @@ BENCH = {"disturbance__preset": "bench", "disturbance__scale": 0.7}
 @pytest.mark.parametrize(
     ("frames", "pair", "delay", "tolerance_nm", "overrides"),
     [
-        # Noise alone makes two such runs differ by 2.5 % rms, in one of the 14 modes by 6 %.
-        (1000, (SOFT, LEAKY), 2, 0.0, {}),
+        # By noise alone, the residuals of two such runs differ by 2.5 % rms over the 14 modes, in one of them by 6 %.
+        (1000, (LOW_TILT_GAIN, LEAKY), 2, 0.0, {}),
         *(
             pytest.param(4000, pair, delay, 0.0, overrides, marks=pytest.mark.slow)
-            for pair in ((HARD, SOFT), (SOFT, LEAKY))
+            for pair in ((HIGH_TILT_GAIN, LOW_TILT_GAIN), (LOW_TILT_GAIN, LEAKY))
             for delay in (1, 1.4, 2, 3)
             for overrides in ({}, BENCH)
         ),
-        # Without noise, tilt near 5 mas appears as 0.1 nm of other modes, some of which have no other error.
+        # Without noise, some modes have no error but the 0.1 nm with which tilt near 5 mas appears in them.
         *(
             pytest.param(2000, pair, 1, 0.1, {"camera__noise": False}, marks=pytest.mark.slow)
-            for pair in ((HARD, SOFT), (SOFT, LEAKY))
+            for pair in ((HIGH_TILT_GAIN, LOW_TILT_GAIN), (LOW_TILT_GAIN, LEAKY))
         ),
     ],
 )
@@ -116,19 +116,19 @@ def test_in_the_linear_range_a_what_if_agrees_with_a_run_with_the_same_gains(
 
 
 FRAMES = 1200
-SETTLING = 599  # frames left out at the start: half of the log, because settling takes even longer
+SETTLING = 599  # frames left out at the start: half of the log, because settling would take longer
 OTHER = "gain=0.3,tilt_gain=0.2,leak=0.01"
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LoggedRun]:
-    """Logs of a closed loop, and of a loop with other gains whose controller assumes a wrong delay."""
+    """Logs of a closed loop, and of a loop with the gains `OTHER` whose controller assumes a wrong delay."""
     folder, runs = tmp_path_factory.mktemp("logs"), {}
     other = {"gain": (0.2, 0.3), "leak": (0.01, 0.01), "delay_frames": 2.0}
     toml = load(None, {"sensor.modes": 10}).to_toml()  # with 10 modes the contrast, which is slow, is not computed
     for name, changes in (("default", {}), ("other", other)):
-        night = SyntheticLog(**changes).frames(FRAMES)
-        runs[name] = LoggedRun(read_history(LogReader(night.write(folder / f"{name}.mcap", toml=toml))))
+        log = SyntheticLog(**changes).frames(FRAMES)
+        runs[name] = LoggedRun(read_history(LogReader(log.write(folder / f"{name}.mcap", toml=toml))))
     return runs
 
 
@@ -176,7 +176,7 @@ def test_added_contrast_is_computed_for_shaped_pupil_and_lyot_coronagraph() -> N
     assert behind_lyot["what if"] > 0
 
 
-class BetweenFramesLog(SyntheticLog):
+class MidExposureLog(SyntheticLog):
     """A log with a delay of 1.5 frames: the mirror moves in the middle of each exposure."""
 
     def _publish(self, advanced: tuple[State, Outputs], late_ns: int = 0) -> None:
@@ -186,9 +186,9 @@ class BetweenFramesLog(SyntheticLog):
 
 
 def test_with_a_fractional_delay_the_continuous_residual_includes_the_motion_of_the_mirror(tmp_path: Path) -> None:
-    """Expected: true disturbance and commands; the mirror moves a quarter of a period after an exposure's start."""
+    """Expected: true disturbance plus commands, which move the mirror a quarter period after an exposure starts."""
     toml = load(None, {"sensor.modes": 10, "camera.delay_frames": 1.5}).to_toml()
-    log = BetweenFramesLog(delay_frames=1.5, gain=(0.6, 0.6)).frames(FRAMES)
+    log = MidExposureLog(delay_frames=1.5, gain=(0.6, 0.6)).frames(FRAMES)
     run = LoggedRun(read_history(LogReader(log.write(tmp_path / "x.mcap", toml=toml))))
     results = results_of(run)
     assert results["delay_frames"] == 1.5
@@ -204,7 +204,7 @@ def test_with_a_fractional_delay_the_continuous_residual_includes_the_motion_of_
 
 
 def test_a_what_if_predicts_the_residual_of_a_run_with_other_gains(runs: dict[str, LoggedRun]) -> None:
-    """Measured residuals of two runs are compared mode by mode."""
+    """The residuals predicted from one run are compared with those measured in the other, mode by mode."""
     predicted, run = results_of(runs["default"], requested_changes(OTHER)), results_of(runs["other"])
     np.testing.assert_allclose(column(predicted, "what_if"), column(run, "was"), rtol=0.1)
     np.testing.assert_allclose(column(predicted, "open"), column(run, "open"), rtol=0.1)
@@ -226,9 +226,9 @@ def test_a_wrong_delay_of_the_controller_is_found_and_corrected(runs: dict[str, 
 
 
 def test_the_clock_of_the_cameras_host_does_not_change_the_measured_delay(tmp_path: Path) -> None:
-    night = SyntheticLog(truth=False).frames(100).health("camera", router_offset_ns=2 * toy.PERIOD_NS)
-    night.samples = [one._replace(publish_time_ns=one.publish_time_ns + 2 * toy.PERIOD_NS) for one in night.samples]
-    run = LoggedRun(read_history(LogReader(night.write(tmp_path / "x.mcap"))))
+    log = SyntheticLog(truth=False).frames(100).health("camera", router_offset_ns=2 * toy.PERIOD_NS)
+    log.samples = [one._replace(publish_time_ns=one.publish_time_ns + 2 * toy.PERIOD_NS) for one in log.samples]
+    run = LoggedRun(read_history(LogReader(log.write(tmp_path / "x.mcap"))))
     assert (run.measured_delay, run.timing.applied) == (2.0, pytest.approx(1.0, abs=0.1))
 
 
@@ -247,7 +247,7 @@ def test_a_configuration_file_gives_the_same_as_the_options(runs: dict[str, Logg
     assert any(f"{by_file['tilt_what_if_mas']:.2f}" in line and "mas" in line for line in table)
 
 
-def test_automatic_gains_of_a_configuration_file_are_the_logged_ones(
+def test_automatic_gains_of_a_configuration_file_stand_for_the_logged_gains(
     runs: dict[str, LoggedRun], tmp_path: Path
 ) -> None:
     path = tmp_path / "automatic.toml"
@@ -267,7 +267,7 @@ def test_automatic_gains_of_a_configuration_file_are_the_logged_ones(
 
 
 def test_another_reconstructor_measures_the_same_frames(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
-    """pinv by name and from a file agree; `weighted`, computed from that file, is the logged reconstructor."""
+    """pinv computed by name and pinv read from a file agree; `weighted` for that file is the logged reconstructor."""
     by_name = results_of(runs["default"], requested_changes("estimator=pinv"))
     assert by_name["estimator"] == "pinv"
     assert by_name["what_if_nm"] != pytest.approx(by_name["was_nm"], rel=1e-3)
@@ -287,7 +287,7 @@ def test_another_reconstructor_measures_the_same_frames(runs: dict[str, LoggedRu
 def test_another_reconstructor_is_weighted_like_the_logged_one(
     runs: dict[str, LoggedRun], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Automatic gains left focus, of 4 nm rms, uncorrected: the same weights reproduce the logged reconstructor."""
+    """Automatic gains left focus, of 4 nm rms, uncorrected: this prior weighted the logged reconstructor."""
     run = runs["default"]
     state = deepcopy(run.history.controllers[-1])
     state.prior_nm2[:], state.weighting_flux_dn = [0, 0, 16], toy.FLUX_DN
@@ -301,7 +301,7 @@ def test_another_reconstructor_is_weighted_like_the_logged_one(
         assert ("weighted the logged reconstructor for modes that they do not correct (focus)" in warnings) == warned
 
 
-def test_frames_that_are_not_in_the_log_are_counted(
+def test_used_frames_that_the_log_lacks_are_counted(
     runs: dict[str, LoggedRun], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another reconstructor cannot measure frames that the log lacks; the what-if holds its command at these frames."""
@@ -364,14 +364,14 @@ def test_a_users_controller_is_run_like_the_integrator(
     runs: dict[str, LoggedRun], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mine.py").write_text(INTEGRATOR)
-    where = f"{tmp_path / 'mine.py'}:step"
+    controller = f"{tmp_path / 'mine.py'}:step"
     users, integrator = (
-        results_of(runs["default"], one) for one in (requested_changes(controller=where), requested_changes(OTHER))
+        results_of(runs["default"], one) for one in (requested_changes(controller=controller), requested_changes(OTHER))
     )
     np.testing.assert_allclose(column(users, "what_if"), column(integrator, "what_if"), rtol=1e-4)
-    assert users["controller"] == where
+    assert users["controller"] == controller
     assert "gain" not in users["modes"][0]
-    assert where in render(users)
+    assert controller in render(users)
     assert "->" not in render(users)
     printed = capsys.readouterr()
     assert printed.out == ""
@@ -379,7 +379,7 @@ def test_a_users_controller_is_run_like_the_integrator(
 
 
 def history(frames: int = 40, **columns: Any) -> History:
-    """History of a closed loop that measures 4 nm of each mode in every frame and whose command is zero."""
+    """History of a closed loop that measures 4 nm of each mode in every frame, and commands zero."""
     values = np.full((frames, 3), 4.0, np.float32)
     default: dict[str, Any] = {
         "sequence": np.array([toy.frame_sequence(count) for count in range(frames)], np.uint64),
@@ -410,7 +410,7 @@ def rows_compared(run: LoggedRun) -> list[int]:
 
 
 def test_an_offset_is_not_reported_as_a_missing_command() -> None:
-    """An offset is the loop's target, which the logged states contain: it reduces the error without a command."""
+    """The logged states contain the offset, the loop's target: it reduces the error without a command."""
     logged = history(error_nm=np.r_[np.full((20, 3), 4, np.float32), np.full((20, 3), 1, np.float32)])
     [last] = logged.controllers
     states = [wire.ControllerState(), wire.ControllerState(), wire.ControllerState(offset_nm=[3] * 3), last]
@@ -423,7 +423,7 @@ def test_an_offset_is_not_reported_as_a_missing_command() -> None:
     np.testing.assert_array_equal(run.seen_nm, 0)
 
 
-def test_a_command_from_before_the_log_is_not_reported_as_a_missing_one() -> None:
+def test_a_command_from_before_the_log_is_not_reported_as_a_missing_command() -> None:
     """With a delay of 2 frames the second frame saw the last command before the log; the log has all later ones."""
     command_nm = np.repeat(np.arange(40, dtype=np.float32)[:, None], 3, axis=1)
     logged = history(command_nm=command_nm, pol_nm=4 - (command_nm - 2))
@@ -434,7 +434,7 @@ def test_a_command_from_before_the_log_is_not_reported_as_a_missing_one() -> Non
 
 
 def test_a_probe_sequence_of_the_target_is_not_reported_as_a_missing_command() -> None:
-    """With 3 nm added to the target in 10 frames the error is smaller by as much; the frames are compared."""
+    """With 3 nm added to the target in 10 frames, the error is smaller by 3 nm; these frames are compared."""
     error_nm = np.full((40, 3), 4, np.float32)
     error_nm[20:30] -= 3
     play = wire.Request(name="play", accepted=True, text="offset", columns=3, frame_sequence=toy.frame_sequence(20))
@@ -445,7 +445,7 @@ def test_a_probe_sequence_of_the_target_is_not_reported_as_a_missing_command() -
     assert rows_compared(run) == list(range(10, 40))
 
 
-def test_neither_a_frame_ahead_nor_an_earlier_camera_start_after_clear_cuts_the_run() -> None:
+def test_neither_a_frame_from_the_future_nor_an_earlier_camera_start_after_clear_shortens_the_run() -> None:
     sequence, reasons = history().steps.sequence, np.zeros(40, np.int64)
     sequence[10], reasons[10] = toy.frame_sequence(0, 2 * toy.START), 1 << Rejection.AHEAD
     sequence[30:] -= np.uint64(1 << 32)
@@ -525,7 +525,7 @@ def test_warnings_name_what_makes_the_results_doubtful() -> None:
         assert expected in warnings
 
 
-def test_a_loop_closed_on_refused_frames_only_is_not_called_never_closed() -> None:
+def test_a_loop_closed_only_on_refused_frames_is_not_reported_as_never_closed() -> None:
     modes = np.repeat(np.array([LoopMode.OPEN, LoopMode.CLOSED], np.uint8), 20)
     run = LoggedRun(history(error_nm=np.repeat(np.float32([[4] * 3, [np.nan] * 3]), 20, axis=0), mode=modes))
     assert run.rows_to_compare([run.law], run.used)[2] == "no usable frame in closed loop"

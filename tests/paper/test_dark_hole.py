@@ -1,4 +1,4 @@
-"""Steps of a dark hole: the loop undoes those that do not shift its zero point. An interrupt ends the loop."""
+"""Steps of a dark hole: the loop undoes only those that do not shift its zero point; an interrupt ends the loop."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,7 +31,7 @@ CONFIG = SMALL_MIRROR | {
 
 
 class LoggedLoop(InProcessLoop):
-    """A loop that keeps all its steps for `history`."""
+    """A loop that keeps all its steps, and returns them with the truth as a history."""
 
     def __init__(self) -> None:
         super().__init__(load(None, CONFIG))
@@ -58,7 +58,7 @@ class LoggedLoop(InProcessLoop):
 
 
 @pytest.mark.parametrize(
-    ("fault", "on_interrupt", "patience_s", "expected", "message"),
+    ("fault", "handler", "patience_s", "expected_error", "message"),
     [
         (RequestRefusedError("too far from flat"), "default_int_handler", 60, LowfcError, "flat; output.* loop: begun"),
         (KeyboardInterrupt(), "default_int_handler", 60, KeyboardInterrupt, None),
@@ -66,9 +66,9 @@ class LoggedLoop(InProcessLoop):
     ],
 )
 def test_a_refused_step_or_an_interrupt_ends_the_loop(
-    fault, on_interrupt, patience_s, expected, message, tmp_path, monkeypatch
+    fault, handler, patience_s, expected_error, message, tmp_path, monkeypatch
 ):
-    begin = f"import os, signal, time; from pathlib import Path; signal.signal(signal.SIGINT, signal.{on_interrupt})"
+    begin = f"import os, signal, time; from pathlib import Path; signal.signal(signal.SIGINT, signal.{handler})"
     record = "Path('pid').write_text(str(os.getpid())); print('begun', flush=True); Path('ready').touch()"
     (tmp_path / "silent.py").write_text(f"{begin}\n{record}\ntime.sleep(600)\n")
 
@@ -81,7 +81,7 @@ def test_a_refused_step_or_an_interrupt_ends_the_loop(
     monkeypatch.setattr(dark_hole, "running", lambda: ["run"] * (tmp_path / "ready").exists())
     monkeypatch.setattr(dark_hole, "new_run_id", lambda: "run")
     monkeypatch.setattr(dark_hole, "Client", fail)
-    with pytest.raises(expected, match=message):
+    with pytest.raises(expected_error, match=message):
         dark_hole.dark_hole(tmp_path, 1.0)
     assert not Path("/proc", (tmp_path / "pid").read_text()).exists()
 
