@@ -1,4 +1,4 @@
-"""The rules of the chaos cases: each holds in a run without a fault, and detects its own kind of fault."""
+"""The rules of the chaos cases, each of which holds without a fault and detects its own; the command `lowfc chaos`."""
 
 import random
 import shutil
@@ -70,7 +70,7 @@ def event(level: Level, text: str) -> Entry:
 
 
 def received(*lost: int) -> Gaps:
-    """Gaps of a topic; all messages were received except the lost ones."""
+    """Gaps of a topic of `FRAMES` messages; all were received except those with the numbers in `lost`."""
     gaps = Gaps(0)
     for number in range(FRAMES):
         if number not in lost:
@@ -87,7 +87,7 @@ def good_entries() -> dict[Topic, tuple[Entry, ...]]:
 
 @pytest.fixture
 def evidence(good_entries: dict[Topic, tuple[Entry, ...]]) -> Evidence:
-    """Logs of a loop without a fault, four seconds long."""
+    """Evidence from the logs of a loop without a fault, four seconds long."""
     evidence = Evidence(messages=5 * FRAMES, log_ends=[(frame_ns(FRAMES), True)])
     for topic, entries in good_entries.items():
         evidence.entries[topic] = list(entries)
@@ -106,7 +106,7 @@ def broken_rules(case: Case, outcome: Outcome, evidence: Evidence) -> dict[str, 
     return {one.rule: one.found for one in judge(case, outcome, evidence) if not one.held}
 
 
-def unflushed(evidence: Evidence, outcome: Outcome) -> None:
+def kill_with_unflushed_log(evidence: Evidence, outcome: Outcome) -> None:
     outcome.killed_ns.append(frame_ns(FRAMES))
     evidence.log_ends.append((frame_ns(500), False))
 
@@ -139,7 +139,7 @@ FAULTS: list[tuple[str, str, Callable[[Evidence, Outcome], object]]] = [
     ("account", f"{STEP.key}: 5 missing", lambda e, _: e.sent.__setitem__(STEPS, FRAMES + 5)),
     ("account", "damaged", lambda e, _: e.unreadable.append("damaged")),
     ("account", "no log", lambda e, _: setattr(e, "messages", 0)),
-    ("account", "flushed", unflushed),
+    ("account", "flushed", kill_with_unflushed_log),
     ("account", "no message is counted", lambda _, outcome: setattr(outcome, "failure", "disk")),
     ("processes", "did not end", ended("mirror-dm", -signal.SIGKILL, PATIENCE_S, True)),
     ("processes", "camera ended with status 1, by itself", ended("camera", 1, 0.0, False)),
@@ -160,12 +160,12 @@ def test_a_fault_breaks_its_rule_and_no_other(
     assert text in broken[rule]
 
 
-def test_losses_that_are_counted_and_refused_frames_that_hold_the_command_break_no_rule(
+def test_counted_losses_and_a_held_command_at_refused_frames_break_no_rule(
     outcome: Outcome, evidence: Evidence
 ) -> None:
     evidence.received[STEPS] = received(7, 8)
     evidence.lost = {STEP.key: 2}
-    evidence.entries[COMMAND].append(shape(FRAMES + 1, 110))  # after a lost command, twice the slew limit is allowed
+    evidence.entries[COMMAND].append(shape(FRAMES + 1, 110))  # after a missing command, twice the slew limit is allowed
     assert broken_rules(CASE, outcome, evidence) == {}
     evidence.entries[STEP][500] = step(500, wire.REASON_DARK, used=False)
     for shapes in (evidence.entries[COMMAND], evidence.entries[MIRROR_STATE]):
@@ -179,14 +179,14 @@ def test_losses_that_are_counted_and_refused_frames_that_hold_the_command_break_
     assert "no bad frame was received" in broken_with(lambda number: False)["bad frames"]
 
 
-def test_a_missing_expected_event_breaks_the_rule(outcome: Outcome, evidence: Evidence) -> None:
+def test_a_missing_expected_event_breaks_the_rule_of_events(outcome: Outcome, evidence: Evidence) -> None:
     case = replace(CASE, expected=("FRAMES_REFUSED frames refused: DARK",))
     assert "no event" in broken_rules(case, outcome, evidence)["events"]
     evidence.entries[EVENT].append(event(Level.WARNING, "FRAMES_REFUSED frames refused: DARK"))
     assert broken_rules(case, outcome, evidence) == {}
 
 
-def test_a_safe_case_requires_the_safe_mode_and_a_flat_mirror(outcome: Outcome, evidence: Evidence) -> None:
+def test_a_case_of_safe_mode_requires_this_mode_and_a_flat_mirror(outcome: Outcome, evidence: Evidence) -> None:
     case = replace(CASE, ends_safe=True)
     assert "closed" in broken_rules(case, outcome, evidence)["recovery"]
     outcome.mode = wire.LOOP_MODE_SAFE
@@ -257,7 +257,7 @@ def test_every_case_has_a_valid_configuration_and_known_events(tmp_path: Path) -
     edges = (FIRST - 1, FIRST, FIRST + FAULTY_FRAMES - 1, FIRST + FAULTY_FRAMES)
     assert [bad(number) for number in edges] == [False, True, True, False]
     assert FORGED_S < START_S
-    bad = CASES["frames-stuck"].is_bad  # the first frames may be used, up to max_identical_frames
+    bad = CASES["frames-stuck"].is_bad  # of the identical frames, the first max_identical_frames may be used
     edges = (FIRST, FIRST + 2, FIRST + 3, FIRST + FAULTY_FRAMES)
     assert [bad(number) for number in edges] == [False, False, True, False]
 
@@ -341,7 +341,7 @@ def test_an_interrupted_command_prints_the_results_so_far() -> None:
     assert not Path("chaos-logs").exists()
 
 
-def test_the_reason_why_a_command_fails_is_given() -> None:
+def test_an_unmet_requirement_has_the_reason_why_its_command_failed() -> None:
     assert unmet("requires it", "true") == ""
     assert unmet("requires it", "ls", "/not/there").startswith("requires it (ls: ")
     assert unmet("requires it", "false") == "requires it (false ended with 1)"
@@ -349,7 +349,7 @@ def test_the_reason_why_a_command_fails_is_given() -> None:
 
 
 def test_a_shifted_clock_is_tried_with_the_shift_of_the_case(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The kernel refuses a monotonic clock below zero: a clock an hour behind needs a host that was up so long."""
+    """The kernel refuses a monotonic clock below zero: a clock an hour behind needs a host that has run for an hour."""
     monkeypatch.setattr("lowfc.programs.reliability.chaos.case.unmet", lambda *arguments: " ".join(arguments[-2:]))
     assert [CASES[f"clock-{kind}"].why_skipped() for kind in ("ahead", "behind")] == ["3600 true", "-3600 true"]
 

@@ -1,4 +1,4 @@
-"""The bench of a chaos case with processes that only sleep, and a console in its own terminal."""
+"""The bench of a chaos case with processes that only sleep, acts on a mock bench, and a console in a terminal."""
 
 import contextlib
 import json
@@ -51,7 +51,7 @@ def status_of(child: Child) -> str:
     return psutil.Process(child.process.pid).status()
 
 
-def test_how_each_process_ended_is_recorded(sleeping: ChaosBench) -> None:
+def test_the_outcome_has_how_each_process_ended(sleeping: ChaosBench) -> None:
     *_, option, file = sleeping.children[Role.CAMERA].command
     assert (option, json.loads(Path(file).read_text())) == ("--fault", {"kind": "dark"})
     for name in (Role.CONTROLLER, Role.RECORDER):
@@ -78,7 +78,7 @@ def test_how_each_process_ended_is_recorded(sleeping: ChaosBench) -> None:
     assert not sleeping.run.path.exists()
 
 
-def test_a_child_that_a_process_leaves_behind_is_reported(sleeping: ChaosBench) -> None:
+def test_a_process_whose_parent_has_ended_is_reported_as_alive(sleeping: ChaosBench) -> None:
     sleeping.restart(Role.CAMERA, ["sh", "-c", "sleep 60 & exit 0"], ready=False)
     until(lambda: sleeping.children[Role.CAMERA].status == 0)
     sleeping.end()
@@ -87,7 +87,7 @@ def test_a_child_that_a_process_leaves_behind_is_reported(sleeping: ChaosBench) 
     os.kill(int(left.split("(")[1].split(",")[0]), signal.SIGKILL)
 
 
-def test_a_full_disk_is_a_limit_on_the_size_of_the_recorders_files(sleeping: ChaosBench) -> None:
+def test_a_full_disk_is_simulated_by_a_limit_on_the_size_of_the_recorders_files(sleeping: ChaosBench) -> None:
     sleeping.restart(Role.RECORDER, ready=False)
     (sleeping.folder / "a.mcap.part").write_bytes(bytes(500))
     sleeping.health[Role.RECORDER] = wire.Health(recording=wire.Recording(failure="no space left"))
@@ -98,8 +98,8 @@ def test_a_full_disk_is_a_limit_on_the_size_of_the_recorders_files(sleeping: Cha
     sleeping.end()
 
 
-def test_a_slow_disk_delays_the_given_writes_and_no_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The program that replaces the recorder is executed here; instead of recording it writes ten times."""
+def test_a_slow_disk_delays_only_the_selected_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The program that replaces the recorder runs in this process; instead of recording, it writes ten times."""
     mock_bench = Mock(
         spec=ChaosBench, children={Role.RECORDER: SimpleNamespace(command=["python", "-m", "lowfc", "record"])}
     )
@@ -137,7 +137,7 @@ def test_a_camera_with_another_clock_is_replaced_by_a_camera_with_the_hosts_cloc
     ]
 
 
-def test_every_killed_or_stopped_process_continues_in_the_random_case() -> None:
+def test_the_random_case_restarts_killed_processes_and_continues_stopped_ones() -> None:
     mock_bench = MagicMock(spec=ChaosBench, rng=random.Random(3), process=str)  # noqa: S311
     CASES["random"].act(mock_bench)
     actions = " ".join(done[0] for done in mock_bench.mock_calls if done[0] != "pause")
@@ -173,7 +173,7 @@ def test_a_stall_is_compared_with_the_time_before_and_after(monkeypatch: pytest.
 
 @pytest.fixture
 def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Function that replaces `lowfc console` by a shell script."""
+    """Function that replaces `lowfc console` by a shell script with this text."""
     script = tmp_path / "program"
 
     def write(text: str) -> None:

@@ -24,7 +24,7 @@ JUNK = ("junk", "forged-commands", "forged-frames", "malformed-requests", "concu
 
 @pytest.fixture
 def in_simulated_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replace every bench by a `ToyBench`; cases wait and intruders send in its simulated time."""
+    """Replace every bench by a `ToyBench`, in whose simulated time cases wait and intruders send."""
 
     def new_bench(*arguments: Any) -> ToyBench:
         toy_bench = ToyBench(*arguments)

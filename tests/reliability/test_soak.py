@@ -1,4 +1,4 @@
-"""Evaluation of a soak's samples: growth is detected, noise is not, gaps are counted."""
+"""Soaks: growth is detected, noise is not, gaps in the logs are counted, and a soak ends with its results."""
 
 import json
 import signal
@@ -61,7 +61,7 @@ def stub(tmp_path: Path) -> Any:
 
 
 def usage(leak_mb_per_hour: float, seed: int = 1, handles_per_hour: float = 0.0) -> list[Usage]:
-    """Usage of a process in each second of half an hour: 100 MB with 2 MB rms of noise, and growth."""
+    """Usage of a process in each second of half an hour: 100 MB plus growth, with noise of 2 MB rms."""
     rng = np.random.default_rng(seed)
     times = np.arange(SECONDS)
     memory = 100e6 + leak_mb_per_hour * 1e6 * times / 3600 + 2e6 * rng.standard_normal(SECONDS)
@@ -129,7 +129,7 @@ def test_a_loop_that_is_not_closed_or_not_recorded_at_the_end_fails(stub: Any) -
 
 
 def test_a_slow_loop_has_time_to_settle() -> None:
-    """250 frames at 2 Hz need 125 s, more than the minute that a fast loop has."""
+    """250 frames at 2 Hz take 125 s; a minute, enough for a fast loop, is added."""
     bench = Mock(config=load(None, {"camera.rate_hz": 2.0}))
     ChaosBench.await_settled(bench, 250)
     assert bench.wait.call_args.args[-1] == 185.0
@@ -146,7 +146,7 @@ def test_a_soak_closes_the_loop_whatever_the_start_mode(tmp_path: Path, monkeypa
     assert soak_loop.call_args.args[0].control.start_mode == "closed"
 
 
-def test_an_interrupted_soak_has_the_results_so_far(stub: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_soak_returns_its_results_so_far(stub: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     stub.begin, stub.end = Mock(), Mock()
     monkeypatch.setattr(run, "ChaosBench", lambda *_: stub)
     monkeypatch.setattr(run, "SAMPLE_S", 0.01)
@@ -156,9 +156,9 @@ def test_an_interrupted_soak_has_the_results_so_far(stub: Any, monkeypatch: pyte
     stub.end.assert_called_once()
 
 
-def log(folder: Path, name: str, counts: dict[str, list[int]], selection: Selection = EVERYTHING) -> None:
+def log(folder: Path, name: str, numbers_by_key: dict[str, list[int]], selection: Selection = EVERYTHING) -> None:
     writer = LogWriter(folder / f"{name}.mcap", 0, selection.metadata)
-    for key, numbers in counts.items():
+    for key, numbers in numbers_by_key.items():
         for number in numbers:
             writer.write(Sample(key, b"", sequence_of(START_S, number), number, number))
     writer.finish({})
@@ -179,7 +179,7 @@ def test_missing_messages_are_counted_within_logs_and_between_them(tmp_path: Pat
 
 
 def test_a_soak_finds_the_process_whose_memory_grows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The loop with the toy sensor runs in simulated time and loses no message."""
+    """The loop, with the toy sensor, runs in simulated time and loses no message."""
 
     def new_bench(*arguments: Any) -> ToyBench:
         toy_bench = ToyBench(*arguments)
