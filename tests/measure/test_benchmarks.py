@@ -1,4 +1,4 @@
-"""Arithmetic of the benchmarks on synthetic results, and one small real run of each."""
+"""Arithmetic of the benchmarks on synthetic results, and small real runs."""
 
 import json
 import subprocess
@@ -28,7 +28,7 @@ SMALL = Size(side=32, modes=5, mirror_side=10)
 
 
 def by_heading(lines: runner.Lines) -> list[dict[str, str]]:
-    """Each line as a dictionary by heading, last column first; of columns with the same heading, the first counts."""
+    """Each line as a dictionary by heading, last column first; of columns with the same heading, the first is kept."""
     assert len({len(line) for line in lines}) == 1
     return [dict(reversed(list(zip(lines[0], line, strict=True)))) for line in lines[1:]]
 
@@ -60,22 +60,24 @@ def test_impossible_options_are_refused(benchmark: runner.Benchmark, arguments: 
 # The control step
 
 
-def test_a_step_retains_no_memory_and_allocates_only_frame_and_actuators(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_keeps_no_memory_and_allocates_only_the_frame_and_shapes_of_the_mirror(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     config = configuration(SMALL, step.RATE_HZ)
     calibration, frames = random_calibration(SMALL, config)
     found = step.allocated(ControlStep(config, calibration, 0), Payloads(frames))
     assert abs(found["kept_bytes"]) < 1
     assert 2 * SMALL.pixels < found["peak_bytes"] < 2 * SMALL.pixels + 5 * 4 * SMALL.actuators + 4096
-    keeping = Mock(wraps=stepping.integrate)  # keeps the arguments of every call
-    monkeypatch.setattr(stepping, "integrate", keeping)
+    leaking = Mock(wraps=stepping.integrate)  # keeps the arguments of every call
+    monkeypatch.setattr(stepping, "integrate", leaking)
     assert step.allocated(ControlStep(config, calibration, 0), Payloads(frames))["kept_bytes"] > 100
 
 
 def test_every_stage_of_a_step_has_a_duration_and_the_remainder_is_not_negative(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    nothing = step.set_up(None, None, lock_memory=False, disable_cpu_idle=False)
-    monkeypatch.setattr(step, "set_up", lambda *_, **__: nothing)  # do not change this process
+    no_measures = step.set_up(None, None, lock_memory=False, disable_cpu_idle=False)
+    monkeypatch.setattr(step, "set_up", lambda *_, **__: no_measures)  # do not change this process
     original = stepping.limit
     found = step.measure(Namespace(seconds=0.2), lambda _: None)
     assert stepping.limit is original
@@ -95,8 +97,8 @@ def test_a_random_calibration_has_the_stated_noise_and_number_of_bytes() -> None
     pixels = frames.reshape(len(frames), -1).astype(float) - calibration.dark
     seen = pixels / pixels.sum(axis=1, keepdims=True) - calibration.reference
     assert 0.5 < np.sqrt(np.mean((seen @ calibration.reconstructor.T) ** 2)) < 2
-    touched = ("reconstructor", "reference", "dark", "good", "modes_to_actuators")
-    assert size.bytes == sum(getattr(calibration, name).nbytes for name in touched) + frames[0].nbytes
+    read = ("reconstructor", "reference", "dark", "good", "modes_to_actuators")
+    assert size.bytes == sum(getattr(calibration, name).nbytes for name in read) + frames[0].nbytes
 
 
 def test_a_step_that_refuses_frames_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,7 +197,7 @@ def test_the_search_finds_the_highest_sustained_rate_despite_one_wrong_result(ed
         return (index <= edge) != mistaken
 
     assert throughput.search(sustains, 32) == edge
-    assert len(tried) <= 2 * 6 + 1  # six bisections of 33 intervals, two runs each, and a third for the wrong result
+    assert len(tried) <= 2 * 6 + 1  # six bisections of 33 answers, two runs each, and a third run after the wrong one
 
 
 def sustained(**changed: Any) -> dict[str, Any]:
@@ -220,9 +222,9 @@ def test_a_rate_is_sustained_if_there_is_no_complaint(one: dict[str, Any], compl
     assert throughput.complaints(one) == complaints
 
 
-def test_a_loop_has_its_highest_rate_and_the_reason_for_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loop_has_its_highest_rate_and_the_reason_why_the_next_rate_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     shares = {"camera": (0.5, "0"), "controller": (0.6, "1"), "mirror": (0.3, "1"), "recorder": (0.2, "0,1")}
-    usage = {role: {"share": share, "processors": where} for role, (share, where) in shares.items()}
+    usage = {role: {"share": share, "processors": processors} for role, (share, processors) in shares.items()}
 
     def run_once(loop_options: Sequence[str], rate_hz: float, seconds: float) -> dict[str, Any]:
         lost = 0 if rate_hz <= 1300 else 7
@@ -236,11 +238,11 @@ def test_a_loop_has_its_highest_rate_and_the_reason_for_its_limit(monkeypatch: p
     none = throughput.highest_rate([], [1400.0], 1.0, lambda _: None)
     assert none["highest_hz"] is None
     result = {"loops": {"simulated": loop, "none": none}, "seconds": 1.0, "rates_hz": rates}
-    speeds, use = throughput.tables(json.loads(json.dumps(result)))
+    speeds, loads = throughput.tables(json.loads(json.dumps(result)))
     assert speeds[1] == ["simulated", "1210", "200", "400", "25 %", "1331 Hz: 7 messages lost"]
     assert speeds[2] == ["none", "none", "", "", "", "1400 Hz: 7 messages lost"]
-    assert use[1] == ["simulated", "1210", "50 % (0)", "60 % (1)", "30 % (1)", "20 % (0,1)", "0: 50 %, 1: 90 %"]
-    assert use[2][:2] == ["simulated", "1000"]
+    assert loads[1] == ["simulated", "1210", "50 % (0)", "60 % (1)", "30 % (1)", "20 % (0,1)", "0: 50 %, 1: 90 %"]
+    assert loads[2][:2] == ["simulated", "1000"]
     assert f"{len(loop['runs']) + len(none['runs'])} runs on a grid of 8 rates" in throughput.about(result)
 
 
@@ -254,7 +256,7 @@ def test_a_real_loop_with_the_simulated_camera_is_measured() -> None:
     assert set(one["usage"]) == {*load.LOOP, "recorder"}
 
 
-def test_a_failed_command_gives_its_error() -> None:
+def test_a_run_of_a_failed_command_has_the_error_of_the_command() -> None:
     one = throughput.run_once(["--camera", "nonsense"], 100.0, 1.0)
     assert "nonsense" in throughput.complaints(one)[0]
 
@@ -266,7 +268,7 @@ def moment(at_s: float, **used_s: float) -> load.Moment:
     return load.Moment(at_s, {role: load.Used(one, "0", 2_000_000) for role, one in used_s.items()})
 
 
-def test_shares_are_averaged_over_the_time_in_which_all_processes_ran() -> None:
+def test_shares_of_processors_are_averaged_over_the_time_in_which_all_processes_ran() -> None:
     moments = [moment(0.0, camera=5.0)]
     moments += [moment(1 + tenth / 10, camera=9 + tenth / 20, controller=1, mirror=tenth / 40) for tenth in range(12)]
     moments += [moment(3.0, camera=99.0)]
@@ -319,7 +321,7 @@ def test_the_statistics_of_a_run_are_computed_from_its_times(tmp_path: Path) -> 
     assert comparison.run_statistics(tmp_path, 2)["command_error"] == 1  # no actuators were received
 
 
-def test_the_tables_have_ranges_differences_within_a_turn_and_missing_implementations() -> None:
+def test_the_tables_have_ranges_and_differences_within_a_turn_and_name_missing_implementations() -> None:
     runs = {
         "C chain": [run_result(55, 440, 3), run_result(66, 110, 9), None],
         "pyrtcao, stock": [],
@@ -345,8 +347,8 @@ def test_the_tables_have_ranges_differences_within_a_turn_and_missing_implementa
     assert fused["frame to command max, us"] == "660 (600 to 690)"
     assert chain["frames without a command"] == "12 of 2000"
     assert [line["frame to command p50, us"] for line in (absent, failed)] == ["not installed", "failed"]
-    (against,) = differences
-    assert list(against.values()) == ["1 of 2", "1 of 2", "-60 (-240 to +120)", "+20 (-6 to +45)", "C chain"]
+    (chain_row,) = differences
+    assert list(chain_row.values()) == ["1 of 2", "1 of 2", "-60 (-240 to +120)", "+20 (-6 to +45)", "C chain"]
     assert [line["implementation"] for line in features] == list(runs)
     about = comparison.about(result)
     for expected in ("CLOCK_MONOTONIC", "get it", "it fell", "refused: that", "SCHED_FIFO 50"):
@@ -397,7 +399,7 @@ def test_a_real_run_of_an_implementation_gives_its_latencies(chosen: implementat
 # Kernels
 
 
-def test_kernels_are_measured_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_kernel_is_measured_once_in_every_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernels, "set_up", lambda *_, **__: None)
     found = kernels.measure(Namespace(side=[32], repeats=2, seconds=0.01), lambda _: None)
     (one,) = found["sizes"]
@@ -411,7 +413,7 @@ def test_kernels_are_measured_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
 # Streams
 
 
-def test_streams_and_the_direct_link_are_compared_turn_by_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_streams_and_the_direct_link_are_compared_within_each_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     order: list[str] = []
 
     def one_run(rate_hz: float, seconds: float, name: str) -> dict[str, Any]:
@@ -428,8 +430,8 @@ def test_streams_and_the_direct_link_are_compared_turn_by_turn(monkeypatch: pyte
     found_p50 = [line["frame to mirror, us: p50"] for line in by_heading(lines)]
     assert found_p50[:3] == ["350 (100 to 600)", "350 (200 to 500)", "350 (300 to 400)"]
     assert found_p50[3:] == ["1.42 (0.83 to 2.00)", "1.83 (0.67 to 3.00)"]
-    _, between, _, ratio, _ = by_heading(lines)
-    assert between["frames without a command"] == "2 of 1000"
+    _, camera_process, _, ratio, _ = by_heading(lines)
+    assert camera_process["frames without a command"] == "2 of 1000"
     assert ratio["frame to command, us: p99"] == "1.00 (1.00 to 1.00)"
     assert "includes 350 (200 to 500) us (p50)" in streams.about(found)
     assert "reads the stream itself, 350 (300 to 400) us" in streams.about(found)

@@ -71,7 +71,7 @@ def frames(
     return frame_outcomes(sequence, put_ns, due_ns, (sequence[timed], stages), (sequence[applied], mirror_ns))
 
 
-def test_percentiles_are_among_the_measured_values() -> None:
+def test_percentiles_are_measured_values() -> None:
     found = percentiles(np.random.default_rng(1).permutation(np.arange(1.0, 1001.0)))
     assert found == {"p50": 500, "p90": 900, "p99": 990, "p99_9": 999, "max": 1000}
     assert percentiles(np.array([np.nan, 3.0])) == dict.fromkeys(("p50", "p90", "p99", "p99_9", "max"), 3.0)
@@ -133,7 +133,7 @@ def test_frames_without_command_are_counted_as_crowded_out_only_in_a_burst() -> 
     found = repeat_statistics(frames(put_ns, command_us, (put_ns - due_ns) / 1e3))
     assert (found["frames_without_command"], found["frames_crowded_out"]) == (3, 2)
     assert found["frames_sent_late"] == 1  # frame 800, by 2 ms; frame 801 is late by less than a period
-    put_ns[900:] += 3600 * 10**9  # the camera waited for its trigger
+    put_ns[900:] += 3600 * 10**9  # the camera waited for its trigger for an hour
     found = repeat_statistics(frames(put_ns, command_us))
     assert (found["frames_crowded_out"], found["rate_hz"]) == (2, pytest.approx(1000, abs=5))
 
@@ -150,7 +150,7 @@ def test_a_histogram_counts_values_beyond_its_edges_in_the_outermost_bins() -> N
 
 
 def repeat(command_us: float, echo_us: float = 100, **changes: Any) -> dict[str, Any]:
-    """A repeat with constant latencies."""
+    """Results of a repeat in which every frame has the same latencies."""
     names = ("p50", "p90", "p99", "p99_9", "max")
     results = repeat_statistics(frames(command_us=float(command_us)))
     alone_us = {"echo_us": echo_us, "step_us": 50.0, "hot_step_us": 25.0, "timer_us": 5.0}
@@ -206,7 +206,9 @@ def test_a_trace_has_the_counters_of_the_kernel_and_page_faults_are_counted() ->
         Counters(own, 0, set())
 
 
-def test_the_last_of_many_processors_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_stolen_time_of_the_last_of_many_processors_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     stat = tmp_path / "stat"
     stat.write_text("".join(f"cpu{number} {'1000000000 ' * 7}{number} 0 0\n" for number in range(512)))
     monkeypatch.setattr("lowfc.adapters.process.host._STAT", stat)
@@ -214,7 +216,7 @@ def test_the_last_of_many_processors_is_read(tmp_path: Path, monkeypatch: pytest
     assert stolen_ns == 511 * 1_000_000_000 // os.sysconf("SC_CLK_TCK")
 
 
-def test_signs_of_a_stall_are_divided_into_signs_of_the_host_and_of_the_loop() -> None:
+def test_evidence_of_a_stall_is_divided_into_evidence_for_the_host_and_for_the_loop() -> None:
     nothing: Any = dict.fromkeys(CountChanges.model_fields, 0)
     cases: list[tuple[dict[str, float], tuple[list[str], list[str]]]] = [
         ({"bare_late_us": 250}, (["bare loop 250 us late"], [])),
@@ -228,13 +230,13 @@ def test_signs_of_a_stall_are_divided_into_signs_of_the_host_and_of_the_loop() -
         assert signs_of(CountChanges(**nothing | counted), 1000) == expected
 
 
-def test_a_stall_has_only_the_counts_of_its_own_time() -> None:
+def test_the_cause_of_a_stall_is_found_from_the_counts_during_it() -> None:
     command_us = np.full(1000, 100.0)
     command_us[100] = 5000  # warm-up
     command_us[600], command_us[601] = 3000, np.nan  # frame 601 is superseded while the host stalls
     command_us[[700, 800, 900, 950]] = 1500, 2000, 1200, 1100
     late_us = np.zeros(1000)
-    late_us[900] = 800  # the stall starts when the frame is due, 0.8 ms before it is published
+    late_us[900] = 800  # this stall begins when the frame is due, 0.8 ms before it is published
     steps = {"stolen_ns": (701, 10 * MS_NS), "waited_ns": (801, 1_200_000), "major_faults": (899, 3)}
     traces = {"camera": trace(late_us={600: 2200}), "controller": trace(steps=steps)}
     found = stalls_of(frames(command_us=command_us, late_us=late_us), MS_NS, traces)
@@ -473,7 +475,7 @@ def test_an_interrupted_or_failed_measurement_removes_its_run(
     assert runs() == before
 
 
-def test_every_log_of_a_measured_recording_counts_and_is_removed(tmp_path: Path) -> None:
+def test_every_log_of_a_measured_recording_is_removed_and_its_size_counted(tmp_path: Path) -> None:
     logs = [tmp_path / "1.mcap", tmp_path / "2.mcap"]
     for log in logs:
         log.write_bytes(b"1234")
