@@ -50,7 +50,7 @@ from tests.support.viewers import listening
 pytest.importorskip("foxglove")
 
 PATIENCE_S = 10.0
-COUNT = 200  # messages of each topic, one per millisecond
+COUNT = 200  # messages of each topic, at most one per millisecond
 _DATA = struct.Struct("<BIQ")  # head of a message: operation 1, number of the subscription, time
 
 STEP_BYTES = wire.ControlStep(frame_sequence=7, mode=wire.LOOP_MODE_CLOSED, error_nm=[1.5, -2.0]).SerializeToString()
@@ -58,7 +58,7 @@ FRAME_BYTES = image(np.arange(12, dtype=np.uint16).reshape(3, 4), 5, "camera").S
 
 
 class Client:
-    """A client: the channels that the server advertises, and the messages of subscribed topics."""
+    """A client of the server; `channels`: the channels that the server advertises, by topic."""
 
     def __init__(self, connection: Any) -> None:
         self.connection = connection
@@ -83,7 +83,7 @@ class Client:
         return message
 
     def decode(self, topic: str, payload: bytes) -> dict[str, Any]:
-        """A message decoded only with the schema that the server advertised."""
+        """A message, decoded with nothing but the schema that the server advertised."""
         channel = self.channels[topic]
         assert (channel["encoding"], channel["schemaEncoding"]) == ("protobuf", "protobuf")
         pool = descriptor_pool.DescriptorPool()
@@ -195,7 +195,7 @@ def test_a_client_that_does_not_read_loses_messages_and_blocks_no_other_client(
     assert 1000 < len(times_ns) < count, "a bounded number of messages waits for the client"
 
 
-def test_the_port_is_on_loopback_only_and_errors_have_one_line(
+def test_the_port_is_on_loopback_only_and_start_errors_have_one_line(
     bridge: FoxgloveBridge, bus: MemoryBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert {host for host, port in listening(os.getpid()) if port == bridge.port} == {"127.0.0.1"}

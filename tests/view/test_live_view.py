@@ -1,4 +1,4 @@
-"""The live view draws the messages of the bus, restarts failed viewers and never blocks the bus."""
+"""The live view draws the messages of the bus, restarts failed viewers, and keeps its memory bounded."""
 
 import contextlib
 import threading
@@ -61,7 +61,7 @@ class FakeViewer:
 
 
 class ViewBench(Listener):
-    """A live view, in a thread, of a run that started before it on an in-memory bus; the first `stuck` viewers hang."""
+    """A live view in a thread, of a run that started before it on a memory bus; the first `stuck` viewers hang."""
 
     memory_mb = 100.0
 
@@ -96,7 +96,7 @@ class ViewBench(Listener):
             self.publishers[sample.key].put(sample.payload)
 
     def drawn(self, number: int) -> bool:
-        """Whether there are this many viewers, and the newest shows steps with their calibration."""
+        """Whether there are this many viewers, and the newest one has drawn modal errors of steps."""
         return len(self.viewers) == number and wavefront.ERROR.path in self.viewers[-1].tape.rows
 
     def end(self) -> None:
@@ -190,7 +190,7 @@ def viewer_grows(bench: ViewBench, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def view_grows(bench: ViewBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    sizes = [live_view.OWN_BYTES + 1]  # too large in one check
+    sizes = [live_view.OWN_BYTES + 1]  # above the limit in one check
     monkeypatch.setattr(live_view, "resident_bytes", lambda: sizes.pop() if sizes else 0)
 
 
@@ -218,7 +218,7 @@ def test_a_failed_viewer_is_restarted_and_shows_everything(
     assert bench.failure is None
 
 
-def test_closing_the_window_ends_the_view(benches: ViewBenches) -> None:
+def test_the_end_of_a_native_viewer_ends_the_view_without_a_restart(benches: ViewBenches) -> None:
     bench = benches(Show.NATIVE)
     bench.viewers[0].alive = False
     bench.thread.join(PATIENCE_S)
@@ -267,7 +267,7 @@ def test_a_view_to_a_file_is_not_restarted(benches: ViewBenches, monkeypatch: py
 
 
 @pytest.mark.parametrize(("pause_s", "all_complete"), [(0.1, True), (0.0, False)])
-def test_complete_snapshots_are_due_by_time_even_if_drawing_is_slow(
+def test_complete_snapshots_are_drawn_on_time_even_if_drawing_is_slow(
     monkeypatch: pytest.MonkeyPatch, pause_s: float, all_complete: bool
 ) -> None:
     complete: list[bool] = []

@@ -1,4 +1,4 @@
-"""Drawing of a log: the verdict on the whole log, the trend, and the events from before the start of a view."""
+"""Drawing of a log: the verdict on the whole log and the trend; and events from before the start of a live view."""
 
 import platform
 import re
@@ -51,7 +51,7 @@ Shown = list[Verdict]
 
 @pytest.fixture
 def shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
-    """The verdicts that are drawn."""
+    """The verdicts drawn in the test, in order."""
     verdicts, picture = Shown(), tiles.picture
 
     def keep(verdict: Verdict, time_ns: int) -> object:
@@ -70,7 +70,7 @@ def drawn(*logs: Path, config: Configuration | None = None) -> tuple[DrawnLogs, 
 @pytest.mark.parametrize(
     ("finish", "value", "level"), [(True, "FINISHED", Level.GOOD), (False, "NO END", Level.WARNING)]
 )
-def test_the_final_verdict_is_on_the_log_and_not_on_a_recording(
+def test_the_final_verdict_judges_the_log_and_no_longer_its_recording(
     tmp_path: Path, shown: Shown, finish: bool, value: str, level: Level
 ) -> None:
     night = SyntheticLog()
@@ -88,7 +88,7 @@ def test_the_final_verdict_is_on_the_log_and_not_on_a_recording(
     ("in_health", "at_the_end", "detail"),
     [((0, 0), 3, "night, 3 messages lost"), ((2, 2), 0, "night, nothing lost"), ((2, 7), 0, "night, 5 messages lost")],
 )
-def test_the_verdict_has_the_losses_during_the_log_and_not_the_recorders_earlier_losses(
+def test_the_verdict_counts_losses_during_the_log_but_not_earlier_losses_of_the_recorder(
     tmp_path: Path, shown: Shown, in_health: tuple[int, int], at_the_end: int, detail: str
 ) -> None:
     night = SyntheticLog()
@@ -114,7 +114,7 @@ def test_the_verdict_says_that_a_file_of_the_log_is_missing(
     assert log.detail.startswith("1 file missing between the first and the last; night-3, ")
 
 
-def test_the_verdict_on_a_log_of_a_fraction_of_a_second_has_its_losses(shown: Shown) -> None:
+def test_the_verdict_on_a_log_of_a_fraction_of_a_second_counts_its_lost_frames(shown: Shown) -> None:
     drawn(Path(__file__).parents[1] / "golden" / "0.1" / "night.mcap")
     assert tile(shown[-1], "FRAMES").detail.startswith("of 164 frames: 1 lost, ")
 
@@ -152,7 +152,7 @@ def test_view_and_report_judge_the_residual_of_a_log_alike(
     assert bool(re.search(harm, shown[-1].headline)) is (in_view is Level.WARNING)
 
 
-def test_the_verdict_on_a_log_says_that_its_residual_includes_a_shape(tmp_path: Path, shown: Shown) -> None:
+def test_the_verdict_on_a_log_says_that_its_residual_includes_offset_and_channels(tmp_path: Path, shown: Shown) -> None:
     log = SyntheticLog().frames(200).request("offset", values=(30.0, 0.0, 0.0)).frames(800)
     drawn(log.write(tmp_path / "shape.mcap"))
     assert tile(shown[-1], "WAVEFRONT").detail.startswith("while closed, with offset and channels, worse than ")
@@ -238,8 +238,8 @@ def test_the_trend_of_a_night_has_a_limited_number_of_spans() -> None:
     begin_ns, rms_nm = averages.wavefront()
     assert span_means.MAX_SPANS / 2 <= len(begin_ns) <= span_means.MAX_SPANS
     np.testing.assert_allclose(rms_nm[0], np.sqrt(squares.mean(axis=0)), rtol=1e-6)
-    assert np.isnan(rms_nm[1:-1]).all()  # nothing in between: a gap
-    for days in (6, 12, 100):  # a view may run for weeks; the last is an error of the clock
+    assert np.isnan(rms_nm[1:-1]).all()  # spans without a wavefront are a gap
+    for days in (6, 12, 100):  # a view may run for weeks; 100 days are an error of the clock
         averages.add(np.array([averages.begin_ns + days * 86_400 * 10**9]), slice(0, 3), np.ones((1, 2)))
     begin_ns, _ = averages.wavefront()
     assert begin_ns[-1] == pytest.approx(12 * 86_400e9, rel=0.02)
@@ -249,7 +249,7 @@ def test_the_trend_of_a_night_has_a_limited_number_of_spans() -> None:
     ("days", "labels"),
     [(0.2, ["23:00", "00:00", "01:00"]), (3, ["11-15", "11-16", "11-17"]), (12, ["11-15", "11-17", "11-19"])],
 )
-def test_the_trend_of_days_has_dates(days: float, labels: list[str]) -> None:
+def test_the_trend_of_hours_has_times_of_day_and_the_trend_of_days_has_dates(days: float, labels: list[str]) -> None:
     ticks = [label for _, label in trend._clock_ticks(1_700_000_000 * 10**9, days * 86_400)]
     assert ticks[:3] == labels
     assert len(ticks) <= 7
@@ -368,7 +368,7 @@ def test_a_limit_in_a_log_is_not_blamed_on_the_disturbance(tmp_path: Path, shown
     assert tile(shown[-1], "MIRROR").advice == "The mirror was at a limit (actuator slew: 1 time): see the events."
 
 
-def test_a_message_of_an_impossible_time_is_left_out(tmp_path: Path) -> None:
+def test_a_message_with_an_impossible_time_is_left_out(tmp_path: Path) -> None:
     night = SyntheticLog().frames(10)
     night.samples.append(night.samples[-1]._replace(receive_time_ns=1 << 63))
     done, _ = drawn(night.write(tmp_path / "night.mcap"))
@@ -416,7 +416,7 @@ def test_earlier_events_are_read_from_the_log_finished_or_not(tmp_path: Path, fi
     expected = [night.samples[index] for index in night.indices(EVENT)]
     found = earlier_events(recorder_of(tmp_path / "night.mcap", platform.node()), 0)
     assert [(one.sequence, one.payload) for one in found] == [(one.sequence, one.payload) for one in expected]
-    accumulator = accumulated([*expected[-1:], *found])  # the last one also arrived on the bus
+    accumulator = accumulated([*expected[-1:], *found])  # the last event also arrived on the bus
     assert len(accumulator.snapshot(1).events) == len(expected)
 
 

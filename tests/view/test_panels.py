@@ -1,4 +1,4 @@
-"""The panels draw the right numbers under the right names."""
+"""The panels of the view draw the right numbers under the right names."""
 
 import dataclasses
 import itertools
@@ -92,13 +92,13 @@ def test_without_truth_the_wavefront_is_labelled_measured() -> None:
     assert wavefront.TRUTH.path not in tape.rows
 
 
-def test_pictures_show_the_newest_frame() -> None:
+def test_pictures_of_the_sensor_show_the_newest_frame() -> None:
     snapshot = snapshot_of(synthetic_log().samples)
     tape = rendered(snapshot)
     frame, calibration = snapshot.frame, snapshot.calibration
     brightness = pixels(tape, sensor.FRAME).sum(axis=2).astype(float)
     order = np.argsort(frame.ravel(), kind="stable")  # the dark is the same in every pixel
-    assert np.all(np.diff(brightness.ravel()[order]) >= 0), "more light is never darker"
+    assert np.all(np.diff(brightness.ravel()[order]) >= 0), "a pixel with more light is never darker"
     change = (frame.ravel() - calibration.dark) / FLUX_DN - calibration.reference
     shown = pixels(tape, sensor.DIFFERENCE).reshape(-1, 3).astype(int)
     strong = np.abs(change) > 0.5 * np.abs(change).max()
@@ -129,7 +129,7 @@ def test_actuators_at_their_limit_are_marked() -> None:
     assert tape.column(mirror.STROKE.path)[1][-1, 0] == pytest.approx(100)
 
 
-def test_the_mode_is_a_band_and_events_have_their_level() -> None:
+def test_the_loop_mode_is_a_band_and_events_have_their_level() -> None:
     night = synthetic_log()
     night.request("open")
     night.frames(10)
@@ -184,7 +184,7 @@ def test_unreadable_messages_and_unknown_values_do_not_affect_other_panels() -> 
 
 @pytest.mark.parametrize("seconds", [10**12, -(10**12), 6 * 10**9])
 @pytest.mark.parametrize("topic", [EVENT, CONTROLLER_STATE, STEP, TRUTH])
-def test_a_message_of_a_time_out_of_range_is_left_out(topic: Topic, seconds: int) -> None:
+def test_a_message_with_a_time_out_of_range_is_left_out(topic: Topic, seconds: int) -> None:
     samples = synthetic_log().samples
     last = next(one for one in reversed(samples) if topic.matches(one.key))
     message = topic.message.FromString(last.payload)
@@ -298,8 +298,8 @@ def truths(residual_nm: Any, disturbance_nm: Any) -> Truths:
     return rows.values()
 
 
-def drawn(panel: Panel, tape: Tape, after_ns: int, **changes: Any) -> None:
-    """Draw a snapshot with nothing new but the changes."""
+def draw(panel: Panel, tape: Tape, after_ns: int, **changes: Any) -> None:
+    """Draw a snapshot that has nothing new but the changes."""
     empty = Accumulator().snapshot(0)
     fields = {"time_ns": START_NS + after_ns, "calibration": CALIBRATION} | changes
     panel.draw(tape, dataclasses.replace(empty, **fields))
@@ -318,11 +318,11 @@ def test_contrast_is_the_mean_over_the_newest_wavefronts() -> None:
     tape, panel = Tape(), science.Science(Coronagraph(pupil), WAVELENGTH_NM)
     panel.begin(tape)
     measured = steps(0, np.vstack([residual_nm[:2], refused]), np.vstack([open_nm[:2], refused]))
-    drawn(panel, tape, 0, steps=measured, calibration=None)
+    draw(panel, tape, 0, steps=measured, calibration=None)
     assert not tape.rows
-    drawn(panel, tape, 0, steps=measured)  # the first snapshot is drawn at once
-    drawn(panel, tape, TICK_NS, steps=measured, truths=truths(residual_nm[2:3], open_nm[2:3]))
-    drawn(panel, tape, science.Science.period_ns, truths=truths(residual_nm[3:4], open_nm[3:4]))
+    draw(panel, tape, 0, steps=measured)  # the first snapshot is drawn at once
+    draw(panel, tape, TICK_NS, steps=measured, truths=truths(residual_nm[2:3], open_nm[2:3]))
+    draw(panel, tape, science.Science.period_ns, truths=truths(residual_nm[3:4], open_nm[3:4]))
     times_ns, found = tape.column(science.CONTRAST.path)
     np.testing.assert_array_equal(times_ns - START_NS, [0, science.Science.period_ns])
     flat = contrast_of(pupil, np.zeros(MODES))
@@ -339,23 +339,23 @@ def test_contrast_is_the_mean_over_the_newest_wavefronts() -> None:
 def test_a_brighter_dark_zone_is_brighter_in_the_picture() -> None:
     tape, panel = Tape(), science.Science(Coronagraph(load_pupil()), WAVELENGTH_NM)
     open_nm = np.full((1, MODES), 90.0)
-    drawn(panel, tape, 0, truths=truths(0 * open_nm, open_nm))
+    draw(panel, tape, 0, truths=truths(0 * open_nm, open_nm))
     shown = pixels(tape, f"{science.IMAGE}/contrast").astype(float).sum(axis=2)
     star, second = science._SAMPLES // 2, science._SECOND
     zone = slice(star + 20, star + 44)  # 5 to 11 lambda/D right of the star, at 4 samples per lambda/D
     now, flat = (shown[star - 4 : star + 4, start:][:, zone].mean() for start in (0, second))
     assert flat > 2 * now
     assert shown[star, star] == shown[star, second + star] == shown.max()  # both stars
-    drawn(panel, tape, science.Science.period_ns)  # nothing new, nothing drawn
+    draw(panel, tape, science.Science.period_ns)  # nothing new, nothing drawn
     assert len(tape.rows[science.CONTRAST.path]) == 1
     further_out = science.Science(Coronagraph(load_pupil(), Wedge(11.0, 16.0)), WAVELENGTH_NM)
-    drawn(further_out, tape, 0, truths=truths(0 * open_nm, open_nm))
+    draw(further_out, tape, 0, truths=truths(0 * open_nm, open_nm))
     assert len(tape.rows[science.CONTRAST.path]) == 2
 
 
 def test_the_trail_has_at_most_400_points_and_ends_at_the_newest() -> None:
     tape, residual_nm = Tape(), np.outer(np.arange(1.0, 800.0), np.ones(MODES))
-    drawn(pointing.Pointing(1.0), tape, 0, truths=truths(residual_nm, residual_nm))
+    draw(pointing.Pointing(1.0), tape, 0, truths=truths(residual_nm, residual_nm))
     points = values_of(tape.last(f"{pointing.TRAIL}/points").positions)
     assert (len(points), points[-1]) == (400, pytest.approx([0.799, -0.799]))  # 1 is the outer ring, 1000 mas
 
@@ -367,7 +367,7 @@ CAMERA = wire.CameraState(period_ns=round(1e9 / RATE_HZ))
 
 @pytest.fixture(scope="module")
 def tone() -> tuple[Any, Any]:
-    """Pseudo-open-loop, a tone in the first mode plus white noise in each, and the error under `LAW`, nm."""
+    """Pseudo-open-loop (frames, modes), a tone in the first mode and white noise, and the error under `LAW`; nm."""
     frames = 3000
     pol_nm = np.random.default_rng(1).normal(0, 0.2, (frames, MODES))
     pol_nm[:, 0] += TONE_NM * np.sqrt(2) * np.sin(2 * np.pi * TONE_HZ / RATE_HZ * np.arange(frames))
@@ -386,7 +386,7 @@ def test_a_tone_has_its_frequency_and_power_in_the_spectrum(tone: tuple[Any, Any
     hz, (pol, error, theory) = spectra.power_curves(found, tilts, LAW, RATE_HZ)
     tone_at = int(pol.argmax())
     assert hz[tone_at] == pytest.approx(TONE_HZ, rel=0.05)
-    noise = 2 * 0.2**2 * 2 / RATE_HZ  # two modes, one-sided
+    noise = 2 * 0.2**2 * 2 / RATE_HZ  # one-sided density of both tilts, nm^2/Hz
     widths_hz = np.diff(np.sqrt(hz[1:] * hz[:-1]))[tone_at - 3 : tone_at + 2]
     power = np.sum((pol[tone_at - 2 : tone_at + 3] - noise) * widths_hz)
     assert power == pytest.approx(TONE_NM**2, rel=0.15)
@@ -399,7 +399,7 @@ def test_a_tone_has_its_frequency_and_power_in_the_spectrum(tone: tuple[Any, Any
     np.testing.assert_allclose(
         predicted[high] / others[high], rejection(hz[high], RATE_HZ, 0.4, 0.01, 2.0) ** 2, rtol=0.15
     )
-    for law in (None, LAW._replace(linear="lqg")):  # only an integrator in force has a prediction
+    for law in (None, LAW._replace(linear="lqg")):  # only an integrator has a predicted spectrum
         assert len(spectra.power_curves(found, tilts, law, RATE_HZ)[1]) == 2
 
 
@@ -410,39 +410,41 @@ def test_spectra_stay_in_their_box_and_restart_when_the_mode_changes(tone: tuple
     state, shown = f"{spectra.TILTS}/state", f"{spectra.TILTS}/curves"
     for first in range(0, 3000, 50):
         new = steps(first, *(one[first : first + 50] for one in reversed(tone)))
-        drawn(panel, tape, round((first + 50) * 1e9 / RATE_HZ), steps=new, camera=CAMERA, controller=controller)
+        draw(panel, tape, round((first + 50) * 1e9 / RATE_HZ), steps=new, camera=CAMERA, controller=controller)
     strips = [np.array(strip) for strip in values_of(tape.last(shown).strips)]
     assert len(strips) == 3
     for strip in strips:
         assert ((strip > -0.01) & (strip < [spectra.WIDTH + 0.01, BOX_HEIGHT + 0.01])).all()
     assert values_of(tape.last(state).labels)[0].startswith("loop closed, last ")
     few = np.ones((20, MODES))
-    drawn(panel, tape, round(9e9), steps=steps(3000, few, few, LoopMode.OPEN), camera=CAMERA, controller=controller)
+    draw(panel, tape, round(9e9), steps=steps(3000, few, few, LoopMode.OPEN), camera=CAMERA, controller=controller)
     assert not values_of(tape.last(shown).strips)
     assert values_of(tape.last(state).labels) == ["loop open: fewer than 64 steady frames"]
-    drawn(panel, tape, round(9.5e9), camera=CAMERA, controller=controller, ended=LogEnd(*[""] * 4, 0, 0, 0, None))
-    assert len(values_of(tape.last(shown).strips)) == 3, "the last known spectra of the log"
+    draw(panel, tape, round(9.5e9), camera=CAMERA, controller=controller, ended=LogEnd(*[""] * 4, 0, 0, 0, None))
+    assert len(values_of(tape.last(shown).strips)) == 3, "the end of a log shows its last spectra"
     assert values_of(tape.last(state).labels) == ["loop closed, last 4.1 s before a change"]
-    drawn(panel, tape, round(9.6e9), controller=controller, ended=LogEnd(*[""] * 4, 0, 0, 0, None))
-    assert len(values_of(tape.last(shown).strips)) == 3, "also without a camera's state, which has the frame rate"
+    draw(panel, tape, round(9.6e9), controller=controller, ended=LogEnd(*[""] * 4, 0, 0, 0, None))
+    assert len(values_of(tape.last(shown).strips)) == 3, (
+        "also without the state of the camera, which has the frame rate"
+    )
 
 
 def test_a_constant_wavefront_has_no_spectrum() -> None:
     tape, constant = Tape(), np.zeros((2000, MODES))
-    drawn(spectra.Spectra(), tape, 0, steps=steps(0, constant, constant))
+    draw(spectra.Spectra(), tape, 0, steps=steps(0, constant, constant))
     assert not values_of(tape.last(f"{spectra.OTHERS}/curves").strips)
 
 
-def test_spectra_of_a_loop_of_tip_and_tilt_alone_state_that_it_has_no_other_modes() -> None:
+def test_spectra_of_a_loop_with_tip_and_tilt_alone_state_that_it_has_no_other_modes() -> None:
     tape, tilts = Tape(), dataclasses.replace(CALIBRATION, noll=(2, 3, 3))
-    drawn(spectra.Spectra(), tape, 0, steps=steps(0, *np.ones((2, 9, MODES))), calibration=tilts)
+    draw(spectra.Spectra(), tape, 0, steps=steps(0, *np.ones((2, 9, MODES))), calibration=tilts)
     assert values_of(tape.last(f"{spectra.OTHERS}/state").labels) == ["loop closed: no such modes"]
 
 
 def test_memory_of_the_spectra_is_bounded() -> None:
     tape, panel, constant = Tape(), spectra.Spectra(), np.ones((500, MODES))
     for first in range(0, 2 * steady.FRAMES, 500):
-        drawn(panel, tape, first, steps=steps(first, constant, constant))
+        draw(panel, tape, first, steps=steps(first, constant, constant))
     kept = len(panel._steady.rows()[0])
     assert steady.FRAMES <= kept < steady.FRAMES + 500
 
@@ -450,7 +452,7 @@ def test_memory_of_the_spectra_is_bounded() -> None:
 def test_the_raw_frame_is_drawn_twice_a_second() -> None:
     panel, tape, frame = sensor.Sensor(), Tape(), np.full(CALIBRATION.shape, 100, np.uint16)
     for number in range(30):
-        drawn(panel, tape, number * TICK_NS, frame=frame, frame_ns=START_NS + number * TICK_NS)
+        draw(panel, tape, number * TICK_NS, frame=frame, frame_ns=START_NS + number * TICK_NS)
     assert len(tape.logged[sensor.RAW]) == 2
 
 
@@ -467,7 +469,7 @@ def test_latencies_are_those_of_the_last_second() -> None:
     reported = {Role.CONTROLLER: controller, Role.RECORDER: recorder}
     health = {role: LastHealth(0, one, one, 0) for role, one in reported.items()}
     for number, timings in enumerate(batches):
-        drawn(panel, tape, number * 100_000_000, timings=timings, health=health)
+        draw(panel, tape, number * 100_000_000, timings=timings, health=health)
     times_ns, found = tape.column(latency.TOTAL.path)
     np.testing.assert_array_equal(times_ns - START_NS, np.arange(4) * latency.Latency.period_ns)
     last_us = {stage: np.concatenate([one[stage] for one in batches[6:]]) / 1e3 for stage in STAGES}
@@ -483,14 +485,14 @@ def test_latencies_are_those_of_the_last_second() -> None:
     np.testing.assert_allclose(np.diff(middles), widths[1:], rtol=1e-6)
     assert tape.column(latency.COUNTS.path)[1][-1].tolist() == [7, 3, 5]
     del health[Role.RECORDER]
-    drawn(panel, tape, 2_000_000_000, health=health)
+    draw(panel, tape, 2_000_000_000, health=health)
     np.testing.assert_array_equal(tape.column(latency.COUNTS.path)[1][-1], [7, 3, np.nan], "unknown without a recorder")
 
 
 def test_a_silent_controller_has_no_latency() -> None:
     tape, panel = Tape(), latency.Latency()
-    drawn(panel, tape, 0, timings={stage: np.full(10, 400_000) for stage in STAGES})
-    drawn(panel, tape, 5_000_000_000)
+    draw(panel, tape, 0, timings={stage: np.full(10, 400_000) for stage in STAGES})
+    draw(panel, tape, 5_000_000_000)
     assert len(tape.rows[latency.TOTAL.path]) == 1
     assert not any(values_of(tape.last(latency.HISTOGRAM).values)[0]["buffer"])
     assert not tape.rows[latency.COUNTS.path], "no Health has arrived"

@@ -1,4 +1,4 @@
-"""The viewer layouts in deploy/layouts: every message path in them is a field of the message on that topic.
+"""The viewer layouts in deploy/layouts: every path in them is a field of the message on the topic of the path.
 
 If a field or topic is renamed, a test fails here rather than a layout during operation.
 """
@@ -138,7 +138,7 @@ MAPPING = "VisualizerInstruction:component_map"
 
 
 def rerun_layout(path: Path) -> tuple[str, Counter[str], set[tuple[str, str]]]:
-    """Application id of a layout, its views and names, and the message and field of each mapping."""
+    """Application id of a layout; counts of its views and names; component and selector of each mapping."""
     reader = RrdReader(path)
     (entry,) = reader.blueprints()
     names: Counter[str] = Counter()
