@@ -33,7 +33,7 @@ def render(results: Results) -> str:
     """A row for each size of the steps."""
     head = (
         *("each step, nm rms of surface", "sum of the steps, nm rms of surface"),
-        *("sum as seen by the sensor, nm of wavefront", "undone, %", "undone without the shift, %"),
+        *("sum as seen by the sensor, nm rms of wavefront", "undone, %", "undone without the shift, %"),
         "true residual before -> after, nm rms",
     )
     rows = [

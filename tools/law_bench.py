@@ -163,7 +163,7 @@ class Bench:
         self._path.applied(self._index, self._status.surface_nm)
 
     def run(self, frames: int, *, record: bool = True) -> None:
-        """Expose, control, move the mirror; with `record`, keep steps and truths, which takes a quarter of the time."""
+        """Expose, control, move the mirror. With `record`, keep steps and truths: this takes a quarter of the time."""
         for _ in range(frames):
             index = self._index
             exposed_nm, pixels = self.expose()

@@ -163,7 +163,7 @@ def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool
 def render(results: Results) -> str:
     """A table with a row for each case and law, and a table of LQG with a row for each case."""
     head = (
-        *("sensor", "law", "residual tilt, mas rms per axis", "predicted from the log, mas"),
+        *("sensor", "law", "residual tilt, mas rms per axis", "predicted from the identified model, mas"),
         *("in theory, mas: disturbance part, noise part", "gain margin", "phase margin, deg"),
     )
     rows = [
