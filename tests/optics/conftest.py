@@ -1,4 +1,4 @@
-"""Fixtures of the optics under test, built once: the real masks at the paper's sampling."""
+"""Fixtures, built once: the default sensor, its modes, its twins `fast`, `accurate`, `broadband`; diffraction codes."""
 
 import importlib
 import importlib.metadata

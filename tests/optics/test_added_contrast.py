@@ -18,20 +18,20 @@ AddedInImage = Callable[[Array], float]
 
 
 @pytest.fixture(scope="module")
-def shaped(sensor: Sensor) -> Coronagraph:
+def coronagraph(sensor: Sensor) -> Coronagraph:
     return Coronagraph(sensor.pupil)
 
 
 @pytest.fixture(scope="module")
-def form(shaped: Coronagraph) -> Array:
-    return contrast_form(shaped, NOLL, WAVELENGTH_NM)
+def form(coronagraph: Coronagraph) -> Array:
+    return contrast_form(coronagraph, NOLL, WAVELENGTH_NM)
 
 
 @pytest.fixture(scope="module")
-def added_in_image(shaped: Coronagraph, modes: Array) -> AddedInImage:
+def added_in_image(coronagraph: Coronagraph, modes: Array) -> AddedInImage:
     def added(modes_nm: Array) -> float:
         flat, aberrated = (
-            mean_contrast(shaped, np.tensordot(each_nm, modes[: len(NOLL)], 1), WAVELENGTH_NM, DARK_ZONE, 4)
+            mean_contrast(coronagraph, np.tensordot(each_nm, modes[: len(NOLL)], 1), WAVELENGTH_NM, DARK_ZONE, 4)
             for each_nm in (0 * modes_nm, modes_nm)
         )
         return aberrated - flat
@@ -53,10 +53,10 @@ def test_spherical_adds_thousands_of_times_more_contrast_than_tilt(form: Array) 
     assert of_mode.argmax() == NOLL.index(11)
 
 
-def test_contrast_added_by_tilt_agrees_with_finer_sampled_images(shaped: Coronagraph, form: Array) -> None:
-    axis = 2 * pupil_axis(len(shaped.pupil))
+def test_contrast_added_by_tilt_agrees_with_finer_sampled_images(coronagraph: Coronagraph, form: Array) -> None:
+    axis = 2 * pupil_axis(len(coronagraph.pupil))
     tilt_nm = zernikes((2,), axis, axis[:, None])[0]
-    flat, plus, minus = (mean_contrast(shaped, x * tilt_nm, WAVELENGTH_NM, DARK_ZONE, 16) for x in (0.0, 1.0, -1.0))
+    flat, plus, minus = (mean_contrast(coronagraph, x * tilt_nm, WAVELENGTH_NM, DARK_ZONE, 16) for x in (0, 1, -1))
     assert form[0, 0] == pytest.approx((plus + minus) / 2 - flat, rel=0.12, abs=0)
 
 
@@ -67,10 +67,10 @@ def test_form_without_negative_eigenvalues_differs_little(form: Array) -> None:
 
 
 def test_added_contrast_is_summed_by_group_and_that_of_large_tilt_is_not_quadratic(
-    shaped: Coronagraph, added_in_image: AddedInImage
+    coronagraph: Coronagraph, added_in_image: AddedInImage
 ) -> None:
     """The cross term of two modes is shared: half of it counts for each mode."""
-    modal, coma, tilt = ModalContrast(shaped, NOLL, WAVELENGTH_NM), NOLL.index(8), NOLL.index(2)
+    modal, coma, tilt = ModalContrast(coronagraph, NOLL, WAVELENGTH_NM), NOLL.index(8), NOLL.index(2)
     shape = np.zeros(len(NOLL))
     shape[[coma, coma - 1, tilt]] = 0.3
     by_mode = modal.by_mode(np.outer(shape, shape))
@@ -84,8 +84,8 @@ def test_added_contrast_is_summed_by_group_and_that_of_large_tilt_is_not_quadrat
     assert not modal.is_beyond_quadratic(0.5**2 * np.diag(np.eye(len(NOLL))[tilt])), "form and image differ by rounding"
 
 
-def test_added_contrast_of_a_run_is_that_of_its_second_half(shaped: Coronagraph, added_in_image: AddedInImage) -> None:
-    contrast = Contrast(ModalContrast(shaped, NOLL, WAVELENGTH_NM))
+def test_added_contrast_is_of_the_second_half_of_a_run(coronagraph: Coronagraph, added_in_image: AddedInImage) -> None:
+    contrast = Contrast(ModalContrast(coronagraph, NOLL, WAVELENGTH_NM))
     assert contrast.measure() == {}
     modes_nm = 0.3 * np.eye(len(NOLL), dtype=np.float32)[NOLL.index(11)]
     for frame in range(5000):  # the residual is ten times larger in the first 2000 frames

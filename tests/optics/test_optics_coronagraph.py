@@ -26,13 +26,13 @@ WAVELENGTH_NM = 550.0
 
 
 @pytest.fixture(scope="module")
-def shaped():
+def coronagraph():
     return Coronagraph(load_pupil())
 
 
 @pytest.fixture(scope="module")
-def flat(shaped):
-    return np.zeros(shaped.pupil.shape)
+def flat(coronagraph):
+    return np.zeros(coronagraph.pupil.shape)
 
 
 def test_open_circle_gives_an_airy_pattern():
@@ -42,37 +42,37 @@ def test_open_circle_gives_an_airy_pattern():
     np.testing.assert_allclose(found, (2 * j1(r) / r) ** 2, atol=2e-4)  # the sampled circle has a staircase edge
 
 
-def test_shaped_pupil_contrast_is_below_1e_9_in_its_dark_zone(shaped, flat):
+def test_shaped_pupil_contrast_is_below_1e_9_in_its_dark_zone(coronagraph, flat):
     dark = wedge_samples(DARK_ZONE, 160, 160)
-    image = contrast(shaped, flat, WAVELENGTH_NM, 160)
+    image = contrast(coronagraph, flat, WAVELENGTH_NM, 160)
     assert image[dark].max() < 1e-9
     assert image[~dark].max() > 0.9
-    fewer_rows = contrast(shaped, flat, WAVELENGTH_NM, 160, 108)
+    fewer_rows = contrast(coronagraph, flat, WAVELENGTH_NM, 160, 108)
     np.testing.assert_allclose(fewer_rows, image[26:134], rtol=1e-9, atol=1e-16)  # the middle rows of the larger image
 
 
-def test_a_tilt_shifts_the_image_of_the_star(shaped):
+def test_a_tilt_shifts_the_image_of_the_star(coronagraph):
     ramp = WAVELENGTH_NM * (3.0 * pupil_axis(512) + 0.5 * pupil_axis(512)[:, None])  # 3 and 1/2 waves across the pupil
-    image = contrast(shaped, ramp, WAVELENGTH_NM, 64)
+    image = contrast(coronagraph, ramp, WAVELENGTH_NM, 64)
     x = image_axis(64, 4)
-    centred = contrast(shaped, np.zeros((512, 512)), WAVELENGTH_NM, 64)
+    centred = contrast(coronagraph, np.zeros((512, 512)), WAVELENGTH_NM, 64)
     np.testing.assert_allclose(image[2:, 12:], centred[:-2, :-12], atol=1e-12)
     row, column = np.unravel_index(image.argmax(), image.shape)
     assert abs(x[column] - 3.0) <= 0.125
     assert abs(x[row] - 0.5) <= 0.125
 
 
-def test_mean_contrast_and_curve_agree_with_the_full_image(shaped, flat, modes):
+def test_mean_contrast_and_curve_agree_with_the_full_image(coronagraph, flat, modes):
     ring = Wedge(4.5, 5.5)
     opd_nm = WAVELENGTH_NM / 30 * (modes[2] + modes[5])
-    image = contrast(shaped, opd_nm, WAVELENGTH_NM, 160)
-    mean = mean_contrast(shaped, opd_nm, WAVELENGTH_NM, ring)
+    image = contrast(coronagraph, opd_nm, WAVELENGTH_NM, 160)
+    mean = mean_contrast(coronagraph, opd_nm, WAVELENGTH_NM, ring)
     assert mean == pytest.approx(image[wedge_samples(ring, 160, 160)].mean(), rel=1e-9)
     edges = np.array([3.5, 4.5, 5.5, 6.5])
-    curve = contrast_curve(shaped, opd_nm, WAVELENGTH_NM, edges)
+    curve = contrast_curve(coronagraph, opd_nm, WAVELENGTH_NM, edges)
     assert curve[1] == pytest.approx(mean, rel=1e-9)
-    assert mean > 30 * mean_contrast(shaped, flat, WAVELENGTH_NM, ring)
-    assert mean_contrast(shaped, opd_nm, WAVELENGTH_NM, ring, samples_per=2) == pytest.approx(mean, rel=0.05)
+    assert mean > 30 * mean_contrast(coronagraph, flat, WAVELENGTH_NM, ring)
+    assert mean_contrast(coronagraph, opd_nm, WAVELENGTH_NM, ring, samples_per=2) == pytest.approx(mean, rel=0.05)
 
 
 def test_wedge_has_the_area_of_its_formula():
@@ -85,9 +85,9 @@ def test_wedge_has_the_area_of_its_formula():
             Wedge(**wrong)
 
 
-def test_wavefront_with_other_sampling_than_the_pupil_is_refused(shaped):
+def test_wavefront_with_other_sampling_than_the_pupil_is_refused(coronagraph):
     with pytest.raises(ValueError, match=r"\(512, 512\), got \(64, 64\)"):
-        contrast(shaped, np.zeros((64, 64)), WAVELENGTH_NM, 8)
+        contrast(coronagraph, np.zeros((64, 64)), WAVELENGTH_NM, 8)
 
 
 def test_screens_have_the_structure_function_of_a_periodic_kolmogorov_screen():
@@ -117,8 +117,8 @@ TILT_NM = 14 * tilt_nm_per_mas(2.0)
 
 
 @pytest.fixture(scope="module")
-def camera(shaped):
-    return ScienceCamera(shaped, NOLLS_14, WAVELENGTH_NM, HALF_WIDTH, SAMPLES_PER)
+def camera(coronagraph):
+    return ScienceCamera(coronagraph, NOLLS_14, WAVELENGTH_NM, HALF_WIDTH, SAMPLES_PER)
 
 
 def wavefront(**nm):
@@ -138,14 +138,14 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_fast_science_image_agrees_with_the_exact_image_to_one_percent(shaped, modes, camera, case):
+def test_fast_science_image_agrees_with_the_exact_image_to_one_percent(coronagraph, modes, camera, case):
     """Tolerance of a sample: 1 % of its value, 0.1 % of the mean, and 1 % of the mean with a flat wavefront."""
     opd_nm = np.tensordot(CASES[case], modes[:14], 1)
-    exact = contrast(shaped, opd_nm, WAVELENGTH_NM, camera.samples, samples_per=SAMPLES_PER)
+    exact = contrast(coronagraph, opd_nm, WAVELENGTH_NM, camera.samples, samples_per=SAMPLES_PER)
     found = camera.image(CASES[case])
     dark = wedge_samples(Wedge(4.0, HALF_WIDTH), camera.samples, camera.samples, SAMPLES_PER)
     np.testing.assert_allclose(found[dark], exact[dark], rtol=1e-2, atol=4e-12 + 1e-3 * exact[dark].mean())
-    mean = mean_contrast(shaped, opd_nm, WAVELENGTH_NM, RING, SAMPLES_PER)
+    mean = mean_contrast(coronagraph, opd_nm, WAVELENGTH_NM, RING, SAMPLES_PER)
     assert camera.mean_contrast(found, RING) == pytest.approx(mean, rel=2e-3)
     assert np.abs(found - exact).max() < 1e-3  # in the whole image, the star's core included
 
@@ -159,15 +159,15 @@ def test_the_fast_image_of_a_pupil_without_2_x_2_blocks_agrees_with_the_exact_im
     np.testing.assert_allclose(camera.image(modes_nm), contrast(plain, opd_nm, WAVELENGTH_NM, 48), rtol=1e-4, atol=1e-7)
 
 
-def test_science_camera_refuses_inconsistent_inputs(shaped, camera):
+def test_science_camera_refuses_inconsistent_inputs(coronagraph, camera):
     with pytest.raises(ValueError, match=r"14 modes, got shape \(3,\)"):
         camera.image(np.zeros(3))
     with pytest.raises(ValueError, match=r"ends 12 lambda/D"):
         camera.mean_contrast(camera.image(np.zeros(14)), Wedge(4.0, 20.0))
     with pytest.raises(ValueError, match="square"):
-        ScienceCamera(Coronagraph(shaped.pupil[:100]), NOLLS_14, WAVELENGTH_NM)
+        ScienceCamera(Coronagraph(coronagraph.pupil[:100]), NOLLS_14, WAVELENGTH_NM)
     with pytest.raises(ValueError, match="must have modes"):
-        ScienceCamera(shaped, (), WAVELENGTH_NM)
+        ScienceCamera(coronagraph, (), WAVELENGTH_NM)
     behind_lyot = Coronagraph(np.ones((126, 126)), lyot=LyotStop(np.ones((8, 8)), np.ones((126, 126))))
     with pytest.raises(ValueError, match="multiple of 4 samples across, got 126"):
         ScienceCamera(behind_lyot, NOLLS_14, WAVELENGTH_NM)

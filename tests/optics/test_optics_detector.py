@@ -11,7 +11,7 @@ from lowfc.optics.detector.photometry import Photometry, electrons, tilt_nm_per_
 NO_READ_NOISE = Detector(read_noise_e=0.0, bias_dn=0.0)
 
 
-def flat(mean_e, side=400):
+def uniform(mean_e, side=400):
     return np.full((side, side), mean_e, np.float32)
 
 
@@ -48,7 +48,7 @@ def test_noise_table_has_the_exact_distribution_at_its_levels(camera):
 def test_a_million_pixels_pass_the_chi_square_test(camera, mean_e):
     """Means at levels of the table, between its levels, and above the table."""
     count, min_expected = 1_000_000, 10
-    frame = expose(camera, flat(mean_e, 1000), rng())
+    frame = expose(camera, uniform(mean_e, 1000), rng())
     numbers = np.arange(400)
     expected = count * probabilities(camera, float(np.float32(mean_e)), numbers)
     found = np.bincount(frame.ravel(), minlength=400)
@@ -62,7 +62,7 @@ def test_a_million_pixels_pass_the_chi_square_test(camera, mean_e):
 def test_an_exact_camera_has_no_noise_table_but_the_same_mean_and_variance():
     camera = Detector(exact=True)
     assert noise_table_of(camera) is None
-    exact, from_table = (expose(one, flat(2.3), rng()).astype(float) for one in (camera, Detector()))
+    exact, from_table = (expose(one, uniform(2.3), rng()).astype(float) for one in (camera, Detector()))
     assert exact.mean() == pytest.approx(from_table.mean(), abs=0.03)
     assert exact.var() == pytest.approx(from_table.var(), rel=0.03)
 
@@ -76,15 +76,15 @@ def test_faint_and_bright_pixels_of_one_frame_are_independent():
 
 def test_electron_multiplication_doubles_the_variance_as_a_long_register_does():
     camera = Detector(gain_e_per_dn=10.0, read_noise_e=0.0, bias_dn=0.0, full_well_e=6e5, em_gain=100.0)
-    frame = expose(camera, flat(20.0), rng()).astype(float) / 10.0  # electrons before multiplication
+    frame = expose(camera, uniform(20.0), rng()).astype(float) / 10.0  # electrons before multiplication
     assert frame.mean() == pytest.approx(20.0, rel=0.01)
     assert frame.var() == pytest.approx(2 * 20.0, rel=0.03)
 
 
 def test_clock_induced_charge_is_multiplied_like_photoelectrons():
     camera = Detector(read_noise_e=0.0, bias_dn=0.0, em_gain=100.0, clock_induced_charge_e=0.05)
-    assert expose(camera, flat(0.0), rng()).mean() == pytest.approx(5.0, rel=0.05)
-    assert expose(Detector(read_noise_e=0.0, bias_dn=0.0), flat(0.0), rng()).max() == 0
+    assert expose(camera, uniform(0.0), rng()).mean() == pytest.approx(5.0, rel=0.05)
+    assert expose(Detector(read_noise_e=0.0, bias_dn=0.0), uniform(0.0), rng()).max() == 0
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_clock_induced_charge_is_multiplied_like_photoelectrons():
 )
 def test_saturation_is_at_the_full_well_or_at_the_limit_of_the_converter(camera, limit):
     assert saturation_dn(camera) == limit
-    frame = expose(camera, flat(1e8, 8), rng())
+    frame = expose(camera, uniform(1e8, 8), rng())
     assert frame.dtype == np.uint16
     assert frame.max() == limit
     assert frame.min() >= limit - 5 * max(1.0, camera.read_noise_e)
@@ -114,10 +114,10 @@ def test_same_seed_gives_the_same_frame_and_input_is_unchanged():
 
 
 def test_negative_electrons_count_as_zero_and_nan_is_an_error():
-    assert expose(NO_READ_NOISE, flat(-1e-9, 4), rng()).max() == 0
-    assert expose(Detector(), flat(-1.0), rng()).mean() == pytest.approx(100, abs=0.02)  # drawn from the table
+    assert expose(NO_READ_NOISE, uniform(-1e-9, 4), rng()).max() == 0
+    assert expose(Detector(), uniform(-1.0), rng()).mean() == pytest.approx(100, abs=0.02)  # drawn from the table
     with pytest.raises(ValueError, match="finite number, got nan"):
-        expose(NO_READ_NOISE, flat(np.nan, 4), rng())
+        expose(NO_READ_NOISE, uniform(np.nan, 4), rng())
 
 
 @pytest.mark.parametrize(
