@@ -26,7 +26,7 @@ def test_gain_errors_differ_between_actuators_and_depend_on_the_seed() -> None:
 
 
 def play(half_width_nm: float, heights_nm: list[float]) -> list[float]:
-    """Play operator: positions of a block in a slot that moves to these heights and pushes the block with its ends."""
+    """Play operator: positions of a block in a slot; the slot moves to these heights, and its ends push the block."""
     positions_nm, position_nm = [], 0.0
     for height_nm in heights_nm:
         if height_nm - position_nm > half_width_nm:

@@ -96,7 +96,7 @@ class InProcessLoop(Client):
         lose: Callable[[int], bool] = lambda index: False,
         cut: int | None = None,
     ) -> None:
-        """Start a loop with `config` in a simulated `world`, by default the same; frames that `lose` selects are lost.
+        """Start a loop with `config` in a simulated `world` (default: `config`); frames that `lose` selects are lost.
 
         With `cut`, frames lack that many pixels at each edge, and no calibration is computed.
         """
@@ -241,7 +241,7 @@ class InProcessLoop(Client):
 def run_loop(config: Configuration, frames: int, calibration: Calibration | None = None) -> SimpleNamespace:
     """Run the loop of a configuration; every frame must be used.
 
-    Returns, in nm rms: error_nm, pol_nm, command_nm (frames, modes) of the steps; and of the truth disturbance_nm,
+    Returns, in nm rms: error_nm, pol_nm, command_nm (frames, modes) of the steps; and of the truth, disturbance_nm,
     residual_nm (frames, modes), and over the open pupil disturbance_rms_nm, residual_rms_nm (frames,).
     """
     bench = Bench(config, calibration or calibrated(config))

@@ -1,4 +1,4 @@
-"""Laws for tests, a loop that runs them, and a theory of the integrator apart from `lowfc.control.laws.margins`."""
+"""Laws for tests, a loop that runs them, and a theory of the integrator independent of `lowfc.control.laws.margins`."""
 
 from collections.abc import Iterable
 
