@@ -112,7 +112,7 @@ ADVICE: dict[str, tuple[str, str]] = {
         "check that the program that held the reservation has stopped.",
     ),
     "INTERLOCK_ACTS": (
-        "a value of the bench meets a condition of `[[interlocks]]`, or is missing, too old or of another type.",
+        "a bench value meets the condition of an interlock, or it is missing, too old or of another type (`when_old`).",
         "remove the cause, or check the publisher of the value.",
     ),
     "INTERLOCK_CLEARED": ("the condition no longer holds.", "close the loop again, if the interlock opened it."),

@@ -111,7 +111,7 @@ def theory_mas(config: Configuration, calibration: Calibration, law: LinearLaw) 
 def tilt_residual_mas(config: Configuration) -> float:
     """Predicted tilt residual of the integrator, mas rms per axis, by a linear model for residuals of a few mas.
 
-    The spectrum of sine waves, damped lines and wheels is known; a square wave and a static wavefront are left out.
+    The spectrum of sine waves, damped lines and steady wheels is known; square wave and static wavefront are left out.
     Photon and read noise propagate through R. For an automatic gain, the highest gain within the margins is used.
     """
     control, delay_frames = config.control, config.camera.delay_frames

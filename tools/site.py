@@ -119,7 +119,7 @@ def json_objects() -> str:
     rows = []
     for result in sorted(printed, key=lambda each: f"{each.__module__}.{each.__name__}"):
         *_, package, module = result.__module__.split(".")
-        command = module if package == "cli" else package  # every other command is a package
+        command = module if package == "cli" else package  # the other commands are packages
         about = f"{one_line(result.__doc__)}. Printed by `lowfc {command}`."
         rows.append(f"### {result.__name__}\n\n{about}\n\n{_field_table(result)}")
     return "\n".join(rows)

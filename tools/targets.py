@@ -64,7 +64,7 @@ def _stalls(results: Results) -> Iterator[Row]:
         0,
         [float(results["frames_without_command"])],
         "{:.0f}",
-        f"{bare}: wake-ups of bare loops, more than a period late",
+        f"wake-ups of bare loops that are more than a period late: {bare}",
         f"the host caused {stalls['of_host']} of the {stalls['stalled']} stalls",
     )
     for name, mb in results["memory_mb"].items():
