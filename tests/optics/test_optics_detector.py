@@ -88,7 +88,7 @@ def test_clock_induced_charge_is_multiplied_like_photoelectrons():
 
 
 @pytest.mark.parametrize(
-    ("camera", "limit"),
+    ("camera", "expected_dn"),
     [
         (Detector(full_well_e=1000.0, gain_e_per_dn=2.0, bias_dn=50.0), 550),
         (Detector(bit_depth=12, bias_dn=50.0), 4095),
@@ -96,12 +96,12 @@ def test_clock_induced_charge_is_multiplied_like_photoelectrons():
         (Detector(full_well_e=5000.0, em_gain=1000.0, bias_dn=0.0), 5000),
     ],
 )
-def test_saturation_is_at_the_full_well_or_at_the_limit_of_the_converter(camera, limit):
-    assert saturation_dn(camera) == limit
+def test_saturation_is_at_the_full_well_or_at_the_limit_of_the_converter(camera, expected_dn):
+    assert saturation_dn(camera) == expected_dn
     frame = expose(camera, uniform(1e8, 8), rng())
     assert frame.dtype == np.uint16
-    assert frame.max() == limit
-    assert frame.min() >= limit - 5 * max(1.0, camera.read_noise_e)
+    assert frame.max() == expected_dn
+    assert frame.min() >= expected_dn - 5 * max(1.0, camera.read_noise_e)
 
 
 def test_same_seed_gives_the_same_frame_and_input_is_unchanged():

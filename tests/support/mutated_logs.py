@@ -133,7 +133,7 @@ ODD_BYTES = (b"", b"\0", b"\xff" * 8, b"\x80" + b"\xff" * 9, b"\x00\x00\xc0\x7f"
 ODD_INTS = (0, 1, 3, 127, 128, 255, 256, 65535, 65536, (1 << 31) - 1, 1 << 31, (1 << 32) - 1, 1 << 40, (1 << 64) - 1)
 ODD_FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-45, 3e38, -3e38, 12.3, float("inf"), float("-inf"), float("nan"))
 ODD_TEXTS = ("", "a", "dm", "mirror", "offset", "é", "\0", "x" * 5000, "../..", "{}", "%s", "status")
-MAX_BYTES = 1 << 16
+MAX_BYTES = 1 << 16  # longest field of bytes in a rewritten message
 _BITS = {
     FieldDescriptor.CPPTYPE_INT32: 31,
     FieldDescriptor.CPPTYPE_ENUM: 31,

@@ -47,7 +47,7 @@ from lowfc.control.loop.state import State
 from tests.support.toy import FLUX_DN, NOLL, PERIOD_NS, SHAPE, START, TOY, calibration, settings
 
 TOY_CALIBRATION = with_identity(calibration())
-DELAY_NS = 300_000  # from a frame to its command
+DELAY_NS = 300_000  # shortest time from a frame to its command
 READ_NOISE_E = 2.0
 METADATA = {"lowfc": {"lowfc": "0.1.0", "numpy": "2.0", "host": "bench", "run": "night", "seed": "5"}}
 

@@ -14,7 +14,7 @@ from lowfc.control.loop.inputs import Frame, Input, Load, Outputs, Step
 from lowfc.control.loop.safety import Limits, LoopMode
 from lowfc.control.loop.state import Settings, State
 
-SHAPE, GRID, NOLL = (6, 7), (4, 5), (2, 3, 4)
+SHAPE, GRID, NOLL = (6, 7), (4, 5), (2, 3, 4)  # pixels, actuators, modes
 FLUX_DN, DARK_DN, SATURATION_DN = 200_000.0, 100.0, 60_000.0
 START = 1_700_000_000  # start of every process, s since 1970
 PERIOD_NS = 1_000_000

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 LIBC = ctypes.CDLL(None, use_errno=True)
-UINT16, INT32, FLOAT32 = 3, 6, 9
+UINT16, INT32, FLOAT32 = 3, 6, 9  # codes of pixel types
 NUMPY_TYPES = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "u8", 8: "i8", 9: "f4", 10: "f8"}
-HEADER, KEYWORD, SEMAPHORE, TRACE = 384, 128, 32, 64
+HEADER, KEYWORD, SEMAPHORE, TRACE = 384, 128, 32, 64  # sizes, bytes
 
 
 def file_of(folder: Path, name: str) -> Path:
