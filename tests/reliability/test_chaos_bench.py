@@ -51,7 +51,7 @@ def status_of(child: Child) -> str:
     return psutil.Process(child.process.pid).status()
 
 
-def test_the_outcome_has_how_each_process_ended(sleeping: ChaosBench) -> None:
+def test_the_outcome_records_how_each_process_ended(sleeping: ChaosBench) -> None:
     *_, option, file = sleeping.children[Role.CAMERA].command
     assert (option, json.loads(Path(file).read_text())) == ("--fault", {"kind": "dark"})
     for name in (Role.CONTROLLER, Role.RECORDER):
