@@ -1,4 +1,4 @@
-"""A driver's process: joining a run, and its command line."""
+"""The process of a driver: it joins a run; parts of its command line."""
 
 import threading
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ from lowfc.device.watch import closed_on_fault, opening
 
 
 def driver_command(kind: Kind, name: str | None = None) -> type[TyperCommand]:
-    """Make a command whose help lists the options of a driver: `name`, or if None the command's argument `driver`."""
+    """Make a command class whose help lists the options of a driver: `name`, or else that of the argument `driver`."""
 
     class WithOptions(TyperCommand):
         driver = name
@@ -33,9 +33,9 @@ def driver_command(kind: Kind, name: str | None = None) -> type[TyperCommand]:
 
         def format_options(self, ctx: Any, formatter: Any) -> None:
             super().format_options(ctx, formatter)
-            accepted = {option for parameter in self.params for option in parameter.opts}  # not passed on to the driver
+            own = {option for parameter in self.params for option in parameter.opts}  # the driver receives the others
             rows = options_help(load(kind, self.driver)) if self.driver else []
-            rows = [row for row in rows if row[0].split()[0] not in accepted]
+            rows = [row for row in rows if row[0].split()[0] not in own]
             if rows:
                 with formatter.section(f"Options of the driver {self.driver}"):
                     formatter.write_dl(rows)
@@ -47,9 +47,9 @@ PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_opt
 """Settings of a command that passes unknown arguments to the driver as its options."""
 Frames = Annotated[int | None, typer.Option(min=1, help="Stop after this many frames; default: at Ctrl-C or SIGTERM.")]
 LEAVE_S = 2.0
-"""Longest time for which an ending controller waits for a camera in its process."""
+"""Longest time for which an ending controller waits until the camera in its process has ended."""
 WaitFor = Annotated[
-    list[str] | None, typer.Option(help="Process that the first frame awaits, up to 30 s; may be repeated.")
+    list[str] | None, typer.Option(help="Process that the first frame waits for, up to 30 s; may be repeated.")
 ]
 
 
@@ -62,14 +62,14 @@ def run_camera(
         driver: driver of the camera.
         config: configuration of the run.
         run: name of the run.
-        frames: number of frames after which it stops; None: no limit.
+        frames: number of frames after which the camera stops; None: no limit.
         wait_for: processes that the first frame waits for.
 
     Raises:
         BusError: the run has a camera already, or one of `wait_for` did not appear.
-        ConfigurationError: the run is in lockstep, and the driver does not wait for the mirror.
-        DataFileError: the run's directory is damaged; across hosts, the camera has no valid certificate here.
-        LowfcError: the driver cannot be started, or reported a fault that a user has to correct.
+        ConfigurationError: the driver cannot be started; or the run is in lockstep, and the driver has no `step`.
+        DataFileError: the run's directory is damaged; or the run has a router, and this host no valid certificate.
+        LowfcError: the driver reported a fault that a user has to correct.
     """
     with closed_on_fault(driver.close):
         if config.lockstep and own_method(driver, "step", CameraExtras.step) is None:
@@ -87,7 +87,7 @@ def run_camera(
 
 @contextmanager
 def camera_beside(driver: Camera, config: Configuration, service: Service) -> Iterator[None]:
-    """Run a camera in the controller's process: the thread that reads a frame also computes its command.
+    """Run a camera in the controller's process: the thread that reads a frame also computes the command.
 
     Other processes see the same role, topics and Health as from a camera in its own process. When the camera or the
     controller ends, so does the other.
@@ -132,7 +132,7 @@ def camera_beside(driver: Camera, config: Configuration, service: Service) -> It
 
 
 def run_mirror(driver: Mirror, config: Configuration, run: str) -> None:
-    """Join a run and apply its commands with the driver until SIGTERM or Ctrl-C; arguments as in `run_camera`.
+    """Join a run and apply the run's commands with the driver until SIGTERM or Ctrl-C; arguments as in `run_camera`.
 
     Raises:
         BusError: the run has this mirror already.

@@ -1,4 +1,4 @@
-"""Linear conversion from nm of surface to clipped drive values in the vendor's order of channels."""
+"""Linear conversion from nm of surface to drive values, clipped and in the vendor's order of channels."""
 
 import numpy as np
 
@@ -12,13 +12,13 @@ from lowfc.device.driver import DriverOptions
 class VoltOptions(DriverOptions):
     """Options of a mirror driven by one value for each channel: volts, or a fraction of their range.
 
-    Files are FITS or .npy, (rows, columns). One unit of value moves the surface by `mirror.nm_per_unit` x gain nm.
+    Files are FITS or .npy, (rows, columns). A value higher by 1 raises the surface by `mirror.nm_per_unit` x gain nm.
     """
 
     zero: float = 0.5
-    """Value at which an actuator is flat."""
+    """Value of an actuator at 0 nm of surface."""
     zero_map: str = ""
-    """File of the flat value of each actuator; empty: `zero` for all."""
+    """File of each actuator's value at 0 nm of surface; empty: `zero` for all."""
     gain_map: str = ""
     """File of each actuator's gain, relative to mirror.nm_per_unit; empty: 1 for all."""
     lowest: float = 0.0
@@ -56,7 +56,7 @@ class VoltMap:
         if len(set(self._channel)) < len(self._channel) or self._channel.max() >= self.channels:
             raise ConfigurationError(
                 f"option order ({options.order or 'none: row by row'}): each actuator needs its own channel below "
-                f"{self.channels}, or -1 without one; got {self._channel.min()} to {self._channel.max()} for "
+                f"{self.channels}, or -1 if it has none; got {self._channel.min()} to {self._channel.max()} for "
                 f"{len(self._channel)} actuators"
             )
         if not (gain.ravel()[self._wired] > 0).all():
@@ -65,7 +65,7 @@ class VoltMap:
         self._nm_per_value = (gain * config.mirror.nm_per_unit).ravel()[self._wired]
         self._range = low, high = options.lowest, options.highest
         if not (low <= self._zero.min() <= self._zero.max() <= high):
-            raise ConfigurationError(f"options zero, zero_map: flat values must be within {low:g} to {high:g}")
+            raise ConfigurationError(f"options zero, zero_map: values at 0 nm must be within {low:g} to {high:g}")
         self._grid = grid
 
     def values(self, actuators_nm: Single) -> Array:

@@ -1,4 +1,4 @@
-"""Watch of a driver: calls that raise or do not return are counted, reported in an event, and retried later."""
+"""Watch of a driver: calls that raise or do not return are counted and reported in events; pauses before retries."""
 
 import re
 import threading
@@ -11,7 +11,7 @@ from lowfc.adapters.process.service import Service
 from lowfc.contract.errors import ConfigurationError, LowfcError
 from lowfc.contract.messages import wire
 
-CHECK_S = 0.1
+CHECK_S = 0.1  # period of the checks whether a call has returned
 PAUSES_NS = (0, 100_000_000, 200_000_000, 500_000_000, 1_000_000_000, 2_000_000_000, 4_000_000_000)
 """Pause before the retry after the first, second, ... consecutive failure, ns."""
 RECOVERED_NS = 1_000_000_000
@@ -25,7 +25,7 @@ _PROGRAMS = _HERE.parent / "programs"
 
 
 def described(fault: Exception | SystemExit) -> str:
-    """Describe an exception of a driver, with the line of the driver that raised it."""
+    """Describe an exception of a driver, with the file and line of the driver that raised it."""
     frames = [
         frame
         for frame in traceback.extract_tb(fault.__traceback__)
@@ -43,14 +43,14 @@ def described(fault: Exception | SystemExit) -> str:
 
 
 @contextmanager
-def opening(what: str) -> Iterator[None]:
-    """Raise any exception of a driver that is not watched yet, except `LowfcError`, as a ConfigurationError."""
+def opening(problem: str) -> Iterator[None]:
+    """Raise a driver's exception, except `LowfcError`, as a ConfigurationError that begins with `problem`."""
     try:
         yield
     except LowfcError:
         raise
     except Exception as fault:
-        raise ConfigurationError(f"{what}: {described(fault)}") from fault
+        raise ConfigurationError(f"{problem}: {described(fault)}") from fault
 
 
 @contextmanager
@@ -163,7 +163,7 @@ class DriverWatch:
             self._service.event("DRIVER_FAILED", why=self.why)
 
     def check(self) -> None:
-        """Report a call that lasts too many checks: they are counted, not timed, as the host may have stood still."""
+        """Report a call that lasts for too many checks; time is not measured, as the host may have been suspended."""
         with self._ending:
             if not self._in_call or self._calls != self._checked_call:
                 self._checked_call, self._checks = self._calls, 0

@@ -42,12 +42,12 @@ def test_a_surface_is_converted_to_clipped_values_in_channel_order(tmp_path: Pat
     ("name", "values", "why"),
     [
         ("order", [[0, 0, 1], [2, 3, 4]], "its own channel"),
-        ("order", [[0, 9, 1], [2, -1, 4]], "below 8, or -1 without one; got 0 to 9 for 5 actuators"),
+        ("order", [[0, 9, 1], [2, -1, 4]], "below 8, or -1 if it has none; got 0 to 9 for 5 actuators"),
         ("order", [[0, 1, 2], [3, 4, 5.5]], "whole number"),
         ("order", [[0, 1, 2], [3, 4, 1e30]], "whole number"),
         ("order", [[-1, -1, -1], [-1, -1, -1]], "no actuator has a channel"),
         ("gain_map", [[0, 1, 1], [1, 1, 1]], "above 0"),
-        ("zero_map", [[2, 0, 0], [0, 0, 0]], "flat values"),
+        ("zero_map", [[2, 0, 0], [0, 0, 0]], "values at 0 nm"),
         ("zero_map", [[0, 0, 0]], "1 x 3 values"),
     ],
 )
