@@ -17,7 +17,7 @@ from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.science_camera import ScienceCamera
 from lowfc.optics.chain.zernike import mode_group, zernikes
 
-_BEYOND_QUADRATIC = 0.1  # relative difference between full images and the quadratic form
+_BEYOND_QUADRATIC = 0.1  # largest relative difference between full images and the quadratic form
 _IMAGE_ROUNDING = 1e-13  # contrast; means of images in single precision are exact to some 1e-14 behind a shaped pupil
 _DRAWS = 24  # random wavefronts compared, each with both signs
 
@@ -39,11 +39,11 @@ class ModalContrast:
         self._camera = ScienceCamera(coronagraph, noll, wavelength_nm, int(np.ceil(self._zone.outer)))
 
     def by_image(self, modes_nm: Array | Single) -> float:
-        """Mean contrast of the dark zone with a wavefront (modes,), nm rms, including that of a flat wavefront."""
+        """Mean contrast of the dark zone with a wavefront (modes,), nm rms; includes the flat wavefront's contrast."""
         return self._camera.mean_contrast(self._camera.image(modes_nm), self._zone)
 
     def by_mode(self, covariance_nm2: Array) -> Array:
-        """Contrast added by each mode (modes,) for wavefronts with a covariance (modes, modes); sums to the total."""
+        """Contrast added by each mode (modes,) for wavefronts of a covariance (modes, modes); the sum is the total."""
         return np.asarray(np.sum(self.form * covariance_nm2, axis=1))
 
     def is_beyond_quadratic(self, covariance_nm2: Array) -> bool:
@@ -59,12 +59,12 @@ class ModalContrast:
 
 
 def beyond_quadratic(form: float, image: float) -> bool:
-    """Whether the contrast added in full images differs from that of the form by over 10 % and not only by rounding."""
+    """Whether the contrast added in full images differs from that of the form by over 10 %, beyond rounding errors."""
     return abs(form - image) > max(_BEYOND_QUADRATIC * abs(image), _IMAGE_ROUNDING)
 
 
 def by_group(noll: Sequence[int], by_mode: Array) -> dict[str, float]:
-    """Added contrast of each mode (modes,) summed over modes of one kind, such as both comas; largest first."""
+    """Added contrast of the modes (modes,), summed over the modes of each kind, such as both comas; largest first."""
     groups: dict[str, float] = {}
     for index, contrast in zip(noll, by_mode.tolist(), strict=True):
         groups[mode_group(index)] = groups.get(mode_group(index), 0.0) + contrast
@@ -72,7 +72,7 @@ def by_group(noll: Sequence[int], by_mode: Array) -> dict[str, float]:
 
 
 def costliest(groups: Mapping[str, float]) -> tuple[str, float]:
-    """The kind of modes that adds most contrast, and its share of the positive values of `groups` (from `by_group`)."""
+    """The kind of modes that adds most contrast, and its share of the positive values in the result of `by_group`."""
     # Behind a classical Lyot coronagraph tilt removes light: its contrast is negative.
     added = [max(contrast, 0.0) for contrast in groups.values()]
     return next(iter(groups)), added[0] / (sum(added) or 1.0)
@@ -90,9 +90,9 @@ def contrast_form(coronagraph: Coronagraph, noll: tuple[int, ...], wavelength_nm
     side = 2 * int(np.ceil(wedge.outer * SAMPLES_PER))
     inside = wedge_samples(wedge, side, side)
     to_focus = kernel(side, SAMPLES_PER, len(pupil), 1.0)
-    radius = 2 * pupil_axis(len(pupil))
+    axis = 2 * pupil_axis(len(pupil))  # in pupil radii
     rows, columns = np.nonzero(pupil)
-    shapes = zernikes(noll, radius[columns], radius[rows])
+    shapes = zernikes(noll, axis[columns], axis[rows])
 
     def image(field: Array) -> Complex:
         return np.asarray(to_focus @ coronagraph.behind(field) @ to_focus.T)

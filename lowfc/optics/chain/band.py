@@ -39,8 +39,8 @@ def gauss_legendre(centre_nm: float, fraction: float = 0.2, count: int = 3) -> B
     """Gauss-Legendre quadrature of a band of relative width `fraction`.
 
     For a band of 20 %, the relative rms error of an image is below 3e-3 with three wavelengths, and below 3e-4 with
-    four, for any layout in the package with a disk behind a shaped or prolate pupil. With a bowtie, or behind an open
-    circle, the error is up to 9e-3 with three and 1.3e-3 with four.
+    four, for any layout in the package, a disk as focal-plane mask, and a shaped or prolate pupil. With a bowtie as
+    mask, or an open circular pupil, the error is up to 9e-3 with three and 1.3e-3 with four.
     """
     points, weights = np.polynomial.legendre.leggauss(count)
     wavelengths_nm = centre_nm * (1.0 + 0.5 * fraction * points)
@@ -50,7 +50,7 @@ def gauss_legendre(centre_nm: float, fraction: float = 0.2, count: int = 3) -> B
 def uniform(centre_nm: float, fraction: float = 0.2, count: int = 5) -> Band:
     """Evenly spaced wavelengths including both ends, with equal weights, as in Sect. 3.3 of the paper.
 
-    Five of these wavelengths give at least six times the error of three wavelengths from `gauss_legendre`.
+    The error of an image with five of them is at least six times that with three of `gauss_legendre`.
     """
     wavelengths_nm = centre_nm * (1.0 + 0.5 * fraction * np.linspace(-1.0, 1.0, count))
     return Band(tuple(wavelengths_nm.tolist()), (1.0 / count,) * count)

@@ -15,8 +15,8 @@ from lowfc.optics.chain.pupil import aberrated
 
 SAMPLES_PER = 4
 """Samples per lambda / D. Two represent the image, but not the sharp edge of a zone, on which the contrast added by
-tilt depends: behind the shaped pupil, two samples give a tenth of the value with 32 samples. Four are within 20 % of
-this value, for other modes too."""
+tilt depends: behind the shaped pupil, two samples give a tenth of the contrast that 32 samples give. Four samples are
+within 20 % of the contrast with 32, for other modes too."""
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,13 @@ DARK_ZONE = Wedge()
 
 @dataclass(frozen=True, eq=False)
 class LyotStop:
-    """The elements of a Lyot coronagraph after its pupil: opaque mask and stop.
+    """The elements of a Lyot coronagraph after its pupil: opaque focal-plane mask and Lyot stop.
 
     Attributes:
         opaque: (k, k) fraction of the amplitude that the focal-plane mask blocks, 0 to 1; the blocked light goes
             to the sensor.
         stop: (n, n) amplitude transmission of the Lyot stop in the pupil after the mask.
-        samples_per: Samples of the opaque part per lambda / D.
+        samples_per: Samples of `opaque` per lambda / D.
     """
 
     opaque: Array
@@ -65,11 +65,11 @@ class LyotStop:
     samples_per: int = 8
 
     def behind(self, field: Array | Complex) -> Complex:
-        """Field (n, n) after the stop for a pupil field before the mask: the field minus the blocked part (Babinet)."""
+        """Field (n, n) after the stop, for a pupil field before the mask; the blocked part is subtracted (Babinet)."""
         return np.asarray(self.stop * (field - self._blocked(field)))
 
     def transposed(self, field: Complex) -> Complex:
-        """The transpose of `behind`, from after the stop to before the mask; `_blocked` is self-adjoint."""
+        """The transposed operator of `behind`, applied to a field (n, n) after the stop; `_blocked` is self-adjoint."""
         stopped = self.stop * field
         return np.asarray(stopped - self._blocked(stopped.conj()).conj())
 
@@ -117,8 +117,8 @@ def contrast(
         coronagraph: The optics.
         opd_nm: Wavefront (n, n), sampled like the pupil.
         wavelength_nm: The wavelength.
-        columns: Samples along x.
-        rows: Samples along y; as many as columns when None.
+        columns: Number of samples along x.
+        rows: Number of samples along y; as many as columns when None.
         samples_per: Samples per lambda / D.
 
     Raises:
@@ -151,8 +151,8 @@ def mean_contrast(
 def contrast_curve(coronagraph: Coronagraph, opd_nm: Array, wavelength_nm: float, edges: Array) -> Array:
     """Contrast (rings,) averaged in azimuth within the opening of `DARK_ZONE`, Fig. 1(c); arguments as for `contrast`.
 
-    `edges` (rings + 1,) are the radii between the rings, in lambda / D. The first radius and the spacing must be at
-    least one sample; a ring without a sample is NaN.
+    `edges` (rings + 1,) are the radii of the rings' edges, in lambda / D. The first radius and the spacing must be at
+    least the distance of two samples; a ring without a sample is NaN.
     """
     sector = Wedge(0.0, float(edges[-1]), DARK_ZONE.half_opening_deg)
     columns, rows = _extent(sector, SAMPLES_PER)

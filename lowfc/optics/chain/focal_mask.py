@@ -5,7 +5,7 @@ import numpy as np
 from lowfc.arrays import Array, Complex
 from lowfc.optics.chain.grid import image_axis
 
-_FINE = 16  # subsamples across a sample, for the fraction covered by the phase spot
+_FINE = 16  # subsamples across a sample, for the fraction of it that the phase spot covers
 
 
 def disk(samples_per: int = 8, radius: float = 4.0, inner_radius: float = 0.0) -> Array:
@@ -21,10 +21,10 @@ def disk(samples_per: int = 8, radius: float = 4.0, inner_radius: float = 0.0) -
 
 
 def phase_spot(samples_per: int = 8, radius: float = 4.0, spot_diameter: float = 1.06) -> Complex:
-    """The disk with a central spot that delays by a quarter of a wave, as in a Zernike sensor.
+    """The disk with a central spot that delays the light by a quarter of a wave, as in a Zernike sensor.
 
-    Samples on the spot's edge are area-weighted means of both sides, since by default the spot is only 8.5 samples
-    wide. The delay is a quarter of a wave at every wavelength, and the physical size of the spot is fixed.
+    Samples on the spot's edge are area-weighted means of spot and disk, as the spot is only 8.5 samples wide by
+    default. The delay is a quarter of a wave at every wavelength, and the physical size of the spot is fixed.
 
     Args:
         samples_per: Samples per lambda0 / D.
@@ -47,6 +47,6 @@ def bowtie(samples_per: int = 8, radius: float = 4.0, outer_radius: float = 10.0
 
 
 def _polar(samples_per: int, radius: float) -> tuple[Array, Array]:
-    """Radius, in lambda0 / D, and angle from the y axis, 0 to pi / 2, of samples (k, k) on a grid of this radius."""
+    """Radius, in lambda0 / D, and angle from the y axis, 0 to pi / 2, of the samples (k, k) around a disk."""
     x = image_axis(2 * int(np.ceil(radius * samples_per)), samples_per)
     return np.hypot(x[:, None], x), np.arctan2(np.abs(x), np.abs(x)[:, None])

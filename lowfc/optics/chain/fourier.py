@@ -11,7 +11,7 @@ from lowfc.optics.chain.grid import image_axis, pupil_axis
 
 @lru_cache(maxsize=32)
 def kernel(image_samples: int, samples_per: int, pupil_samples: int, scale: float) -> Complex:
-    """Kernel exp(-2 pi i x u scale), (image_samples, pupil_samples), read-only; scale is lambda0 / lambda."""
+    """Kernel exp(-2 pi i x u scale) (image_samples, pupil_samples), read-only; scale is lambda0 / lambda."""
     x = image_axis(image_samples, samples_per)
     u = pupil_axis(pupil_samples)
     matrix: Complex = np.exp(-2j * np.pi * scale * np.outer(x, u))

@@ -11,7 +11,7 @@ from lowfc.optics.chain.zernike import zernikes
 
 _TIKHONOV = 1e-4
 """Regularisation, relative to the mean diagonal element of the normal matrix. With 1e-6 the mean error of the fit would
-be the same, 1.2 %, but the largest command of a mode, at the edge, would be up to three times as large."""
+be the same, 1.2 %, but the largest command of an actuator, at the edge, would be up to three times as large."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Mirror:
         columns: Actuators along x.
         pitches_per_pupil: Actuator pitches across the pupil's diameter.
         coupling: Surface at the neighbour of a poked actuator divided by the surface at the poked actuator.
-        shift_pitches: Offset of the actuators from the centre, equal along x and y.
+        shift_pitches: Shift of the actuators relative to the pupil, in pitches, equal along x and y.
     """
 
     rows: int = 34
@@ -50,8 +50,8 @@ def actuator_axis(mirror: Mirror, actuators: int) -> Array:
 def influence_factors(mirror: Mirror, coordinates: Array, actuators: int) -> Array:
     """One axis of the influence functions, (points, actuators); surface = y_factors @ actuators @ x_factors.T.
 
-    Points must be closer than half a pitch, or the print-through of the actuators aliases to low frequencies;
-    `twin_mirror` corrects this on the nodes of a twin.
+    The spacing of the points must be below half a pitch, or the print-through of the actuators aliases to low
+    frequencies; `twin_mirror` corrects this on the nodes of a twin.
 
     Args:
         mirror: The mirror.
@@ -73,14 +73,14 @@ def active_actuators(mirror: Mirror) -> Mask:
 def modes_to_actuators(mirror: Mirror, nolls: Sequence[int], usable: Mask | None = None) -> Array:
     """Modes-to-actuators matrix (M2C) of Zernike modes: nm of surface at the actuators per nm rms of wavefront.
 
-    It is a regularised least-squares fit over the circle. It includes the 1/2 of reflection: the wavefront is twice
-    the surface.
+    It is a regularised least-squares fit over the circle. It includes the factor 1/2 of reflection: the wavefront is
+    twice the surface.
 
     Args:
         mirror: The mirror.
         nolls: Noll indices.
-        usable: (rows, columns) mask of actuators that may be commanded; all when None. The others stay at zero, and
-            their neighbours compensate as far as possible.
+        usable: (rows, columns) mask of actuators that may be commanded; all when None. The other actuators stay at
+            zero, and their neighbours compensate as far as possible.
 
     Returns:
         (rows times columns, modes); inactive actuators are exactly zero.

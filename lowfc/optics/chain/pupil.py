@@ -1,4 +1,4 @@
-"""Pupils: open circle, apodised pupils for coronagraphs, circle with a bar for the relay; the field behind a pupil."""
+"""Pupils: open circle, apodised pupils of coronagraphs, circle with a bar for the relay; the field behind a pupil."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -58,7 +58,7 @@ def prolate(samples: int, mask_radius: float) -> Array:
 
 
 def _mask_kernel(r: Array, rho: Array, radius: float) -> Array:
-    """Kernel from pupil via mask to pupil: integral of x J0(2 pi r x) J0(2 pi rho x) over x from 0 to the radius."""
+    """Kernel (r, rho) pupil to mask to pupil: integral of x J0(2 pi r x) J0(2 pi rho x) over x from 0 to `radius`."""
     from scipy.special import j0, j1  # its import takes a quarter of a second; most processes load a stored result
 
     a, b = 2.0 * np.pi * r[:, None], 2.0 * np.pi * rho[None, :]
@@ -105,9 +105,9 @@ def from_quarter(quarter: ArrayLike, samples: int) -> Array:
 
 
 def aberrated(pupil: Array, opd_nm: NDArray[np.floating], wavelength_nm: float) -> Complex:
-    """Field (n, n) after a pupil of a wavefront (n, n) in nm; ValueError if it is not sampled like the pupil."""
+    """Field (n, n) after a pupil for a wavefront (n, n) in nm; ValueError if it is not sampled like the pupil."""
     if opd_nm.shape != pupil.shape:
         raise ValueError(f"a wavefront must be sampled like the pupil, {pupil.shape}, got {opd_nm.shape}")
-    field, transmits = np.zeros(pupil.shape, np.complex128), pupil != 0  # a fifth of a shaped pupil
+    field, transmits = np.zeros(pupil.shape, np.complex128), pupil != 0  # a fifth of the samples, for a shaped pupil
     field[transmits] = pupil[transmits] * np.exp((2j * np.pi / wavelength_nm) * opd_nm[transmits])
     return field

@@ -55,7 +55,7 @@ Relay = ApertureMask | Defocus | PupilImage
 
 
 def fresnel_distance(defocus_mm: float, focal_ratio: float, wavelength_nm: float) -> float:
-    """Distance z / (lambda0 F^2): 27.3 for the 6 mm, F/20 and 550 nm of the paper's Sect. 3."""
+    """Distance z / (lambda0 F^2), in (lambda0/D)^2: 27.3 for the 6 mm, F/20 and 550 nm of the paper's Sect. 3."""
     return defocus_mm * 1e6 / (wavelength_nm * focal_ratio**2)
 
 
@@ -63,10 +63,10 @@ def fresnel_distance(defocus_mm: float, focal_ratio: float, wavelength_nm: float
 def direct_kernel(
     relay: Defocus | PupilImage, samples: int, focal_samples: int, samples_per: int, scale: float
 ) -> Complex:
-    """Kernel (samples, focal_samples), read-only, of one axis from focal-plane mask to detector; conserves energy.
+    """Kernel (samples, focal_samples), read-only, from focal-plane mask to detector along one axis; conserves energy.
 
-    For a `Defocus`, the Fresnel integral of the paper's eq. (13), exp(i pi (x' - x)^2 scale / distance), exact as long
-    as the chirp is resolved; for a `PupilImage`, the transform to the relay pupil.
+    For a `Defocus` it is the Fresnel integral of the paper's eq. (13), exp(i pi (x' - x)^2 scale / distance), exact if
+    the samples resolve the chirp; for a `PupilImage` it is the Fourier transform to the relay pupil.
 
     Args:
         relay: The optics between mask and detector.

@@ -24,7 +24,7 @@ class Layout:
 
 
 def check(layout: Layout) -> None:
-    """Raise ValueError if there is no hole, or a hole has an impossible size, leaves the pupil or overlaps another."""
+    """Raise ValueError without holes, or if a hole has an impossible size, leaves the pupil or overlaps another."""
     if not layout.holes:
         raise ValueError(f"{layout.name}: a sparse aperture mask needs at least one hole")
     holes = np.array(layout.holes, dtype=np.float64)
@@ -57,7 +57,7 @@ def check(layout: Layout) -> None:
 
 
 def is_even_symmetric(layout: Layout) -> bool:
-    """Whether every hole has a counterpart opposite the centre; such a mask cannot sense focus or astigmatism."""
+    """Whether every hole has an equal one opposite the centre; such a mask cannot sense focus or astigmatism."""
     holes = np.array(layout.holes, dtype=np.float64)
     mirrored = holes * np.array([-1.0, -1.0, 1.0])
     distances = np.linalg.norm(holes[:, None] - mirrored, axis=2)
@@ -70,7 +70,7 @@ def transmission(layout: Layout, samples: int, points: int = 1) -> Array:
     Args:
         layout: The holes.
         samples: Samples across the pupil.
-        points: Points that are evaluated across a sample in each direction; 1 for the sample's centre only.
+        points: Number of points evaluated across a sample in each direction; 1 for the sample's centre only.
 
     Raises:
         ValueError: A hole is so small that no evaluated point lies in it.
@@ -82,8 +82,8 @@ def transmission(layout: Layout, samples: int, points: int = 1) -> Array:
         inside = np.hypot(u[box[0]] - y, u[box[1]] - x) <= diameter / 2.0
         if not inside.any():
             raise ValueError(
-                f"{layout.name}: the hole at ({x}, {y}) is lost between points {1 / u.size:.2g} D apart, as its "
-                f"diameter is {diameter:g} D: give lengths in pupil diameters, or raise sensor.hole_samples"
+                f"{layout.name}: the hole at ({x}, {y}) is lost between points {1 / u.size:.2g} D apart: its "
+                f"diameter is {diameter:g} D; give lengths in pupil diameters, or raise sensor.hole_samples"
             )
         mask[box] += inside
     return np.asarray(mask.reshape(samples, points, samples, points).mean(axis=(1, 3)))

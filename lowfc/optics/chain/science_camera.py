@@ -1,4 +1,4 @@
-"""Science images of modal wavefronts, fast enough for a live view: `coronagraph.contrast` with prepared kernels."""
+"""Science images for modal wavefronts, fast enough for a live view: `coronagraph.contrast` with prepared kernels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,12 +19,12 @@ class ScienceCamera:
     """Contrast of a coronagraph, in single precision, from modal wavefronts.
 
     The field is summed over the open cells of the pupil only: the wavefront is evaluated at each cell's centre, and the
-    Fourier kernel is summed over the cell's samples. Cells have 2 x 2 samples if the pupil is constant within each, as
-    in the package's shaped pupil, otherwise one sample. For a Lyot coronagraph cells have 4 x 4 samples, over which the
-    pupil is averaged.
+    Fourier kernel is summed over the cell's samples. For a shaped pupil alone, cells have 2 x 2 samples if the pupil is
+    constant within each, as in the package's pupil, otherwise one. For a Lyot coronagraph they have 4 x 4 samples, over
+    which the pupil is averaged.
 
     Attributes:
-        samples: Samples across the square image, at the positions of `grid.image_axis`.
+        samples: Number of samples across the square image; their positions are those of `grid.image_axis`.
         samples_per: Samples per lambda / D.
         wavelength_nm: The wavelength.
     """
@@ -47,8 +47,8 @@ class ScienceCamera:
             samples_per: Samples per lambda / D.
 
         Raises:
-            ValueError: The pupil is not square, transmits no light, or is not a multiple of 4 samples across with a
-                Lyot stop; or there are no modes.
+            ValueError: The pupil is not square or transmits no light; with a Lyot stop, its samples across are no
+                multiple of 4; or there are no modes.
         """
         pupil, lyot = coronagraph.pupil, coronagraph.lyot
         if pupil.ndim != 2 or pupil.shape[0] != pupil.shape[1] or not pupil.any():
@@ -96,7 +96,7 @@ class ScienceCamera:
         return np.asarray(field.real**2 + field.imag**2)
 
     def mean_contrast(self, image: Single, wedge: Wedge) -> float:
-        """Mean of an image (rows, columns) over the samples in a wedge, as in `coronagraph.mean_contrast`.
+        """Mean of an image (samples, samples) over the samples in a wedge, as in `coronagraph.mean_contrast`.
 
         Raises:
             ValueError: The wedge reaches beyond the image.
@@ -111,11 +111,11 @@ class ScienceCamera:
 
 @dataclass(frozen=True, eq=False)
 class _Lyot:
-    """A `LyotStop` for cells (rows, columns) of several samples, in single precision.
+    """A `LyotStop` in single precision for the used cells (rows, columns) of the pupil.
 
     Attributes:
-        to_y, to_x: (k, rows) and (columns, k) kernels from the cells to the opaque part.
-        back_y, back_x: (rows, k) and (k, columns) kernels from the opaque part to the stop.
+        to_y, to_x: (k, rows) and (columns, k) kernels from the cells to the opaque mask.
+        back_y, back_x: (rows, k) and (k, columns) kernels from the opaque mask to the stop.
         opaque: (k, k) fraction of the amplitude that the mask blocks.
         stop: (rows, columns) amplitude transmission.
     """

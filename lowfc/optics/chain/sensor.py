@@ -48,7 +48,7 @@ class Sensor:
             raise ValueError(f"the focal-plane mask must be square, got shape {self.focal_mask.shape}")
         if isinstance(self.relay, Defocus):
             reach = (self.pixels * self.binning + self.focal_mask.shape[0]) / (2.0 * self.samples_per)
-            # The sum over the focal plane aliases where the phase of chirp times field advances by a wave per sample.
+            # The sum over the focal plane aliases if the phase of chirp times field advances by a wave per sample.
             spare = 2.0  # cycles per lambda0 / D: 0.5 for the edge of the pupil, 1.5 for short wavelengths
             least = reach / (self.samples_per - spare)
             if self.relay.distance < least:
@@ -72,7 +72,7 @@ class Sensor:
 
 @dataclass(frozen=True)
 class LightBudget:
-    """Throughput of the elements; each attribute is a fraction of the light that its description names.
+    """Throughput of the elements, each relative to the light that its description names.
 
     Attributes:
         pupil: Fraction of the open circle's light that the pupil mask transmits.
@@ -129,12 +129,12 @@ def from_focus(sensor: Sensor, focal: Complex, wavelength_nm: float) -> Complex:
 
 
 def field(sensor: Sensor, opd_nm: NDArray[np.floating], wavelength_nm: float | None = None) -> Complex:
-    """Field at the sensor's samples for a wavefront (n, n) in nm, from the full exp(i phi), not its expansion.
+    """Field at the sensor's samples for a wavefront (n, n) in nm, from the full exp(i phi), not from its expansion.
 
     Args:
         sensor: The optics.
-        opd_nm: Optical path difference.
-        wavelength_nm: The central wavelength when None.
+        opd_nm: Wavefront (n, n).
+        wavelength_nm: The wavelength; the central one when None.
 
     Raises:
         ValueError: The wavefront is not sampled like the pupil.
@@ -189,8 +189,8 @@ def response(sensor: Sensor, basis: NDArray[np.floating], band: Band | None = No
 def shear_response(sensor: Sensor, band: Band | None = None) -> Array:
     """dI/ds (pixels squared, 2), in the units of `image` per pupil diameter of shear of the beam along x and y.
 
-    A shift of the beam in the pupil is a phase ramp in the focal plane: the derivative of the field is -2 pi i x times
-    the field. Shear is a nuisance parameter: beam wander on the relay mask mimics a wavefront error.
+    A shift of the beam in the pupil is a phase ramp in the focal plane: there, the derivative of the field is -2 pi i x
+    times the field. Shear is a nuisance parameter: beam wander on the relay mask mimics a wavefront error.
 
     Args:
         sensor: The optics.
@@ -209,7 +209,7 @@ def shear_response(sensor: Sensor, band: Band | None = None) -> Array:
 
 
 def light_budget(sensor: Sensor) -> LightBudget:
-    """The throughput of each element at the central wavelength, flat wavefront."""
+    """The throughput of each element at the central wavelength, for a flat wavefront."""
     samples, area = sensor.pupil.shape[0], 1.0 / sensor.samples_per**2
     focal = to_image(sensor.pupil, sensor.focal_mask.shape[0], sensor.samples_per, 1.0)
     focal = focal * sensor.focal_mask
@@ -231,6 +231,6 @@ def light_budget(sensor: Sensor) -> LightBudget:
 
 
 def pixel_sums(sensor: Sensor, intensity: Array) -> Array:
-    """Sums (pixels, pixels) of an intensity (samples, samples), as fractions of the light in the open circle."""
+    """Sums (pixels, pixels) of an intensity (samples, samples) over each pixel, relative to the open circle's light."""
     shape = (sensor.pixels, sensor.binning, sensor.pixels, sensor.binning)
     return np.asarray(intensity.reshape(shape).sum(axis=(1, 3))) * (sensor.pitch**2 / OPEN_AREA)

@@ -62,14 +62,14 @@ def expose(detector: Detector, electrons: NDArray[np.floating], rng: np.random.G
     """One frame (rows, columns) in DN.
 
     Electrons are drawn from the Poisson distribution. Multiplication draws from the gamma distribution of a long
-    register at a high gain, whose excess noise doubles the variance of the photons. At a finite gain g, it
-    multiplies the variance by about 2 - 1 / g.
+    register at a high gain, whose excess noise doubles the photons' variance. A real register of gain g multiplies the
+    variance by about 2 - 1 / g.
 
-    If `noise_table_of` returns a table, it yields the digital numbers of pixels with a mean below `FAINT_E` electrons.
-    Their distribution is exact at means that are multiples of 1/64 electron. Between these the mean is exact and the
+    If `noise_table_of` returns a table, pixels with a mean below `FAINT_E` electrons are drawn from it. Their
+    distribution is exact at means that are multiples of 1/64 electron. Between these the mean is exact and the
     variance too large by at most 6e-5 electrons squared. With a read noise of half an electron or more, a chi-square
-    test of a million draws does not detect this; with less, two electrons in a pixel with a mean near 0.005 are too
-    frequent.
+    test of a million draws does not detect this. With a lower read noise, two electrons are too frequent in a pixel
+    with a mean near 0.005.
 
     Args:
         detector: The detector.
@@ -85,7 +85,7 @@ def expose(detector: Detector, electrons: NDArray[np.floating], rng: np.random.G
         mean = np.maximum(mean, np.float32(0)) + np.float32(detector.clock_induced_charge_e)
     brightest_e = float(mean.max(initial=0))
     if not brightest_e < np.inf:
-        raise ValueError(f"the electrons expected in a pixel must be a finite number, got {brightest_e}")
+        raise ValueError(f"the mean electrons in a pixel must be a finite number, got {brightest_e}")
     table = noise_table_of(detector)
     if table is None:
         return _expose_exactly(detector, mean, rng).reshape(electrons.shape)
@@ -105,7 +105,7 @@ def noise_table_of(detector: Detector) -> NoiseTable | None:
 
 
 def _expose_exactly(detector: Detector, mean_e: Single, rng: np.random.Generator) -> Pixels:
-    """Pixels (pixels,) in DN, step by step: electrons, multiplication, read noise, rounding."""
+    """Pixels (pixels,) in DN, step by step: electrons, multiplication, full well, read noise, rounding."""
     charge = rng.poisson(np.maximum(mean_e, 0)).astype(np.float32)
     if detector.em_gain > 1.0:
         charge = rng.standard_gamma(charge, dtype=np.float32)

@@ -12,7 +12,7 @@ _RADIANS_PER_MAS = np.pi / (180.0 * 3600.0 * 1000.0)
 
 @dataclass(frozen=True)
 class Photometry:
-    """A star, a telescope and the losses before the first mask; the defaults are those of Sect. 3.3.
+    """A star, a telescope and losses of light; the defaults are those of Sect. 3.3.
 
     Attributes:
         magnitude: V magnitude of the star.
@@ -41,7 +41,7 @@ class Photometry:
 
 
 def electrons(photometry: Photometry, exposure_s: float) -> float:
-    """Electrons per exposure from all light through the open circle: the factor from fractions of it to electrons."""
+    """Electrons per exposure from all light in the open circle: factor from fractions of this light to electrons."""
     area_m2 = np.pi / 4.0 * photometry.diameter_m**2
     flux = PHOTONS_PER_S_M2_NM * 10.0 ** (-0.4 * photometry.magnitude)
     collected = flux * area_m2 * photometry.bandwidth_nm * exposure_s

@@ -1,9 +1,9 @@
 """The optics at one wavelength as a real matrix, from separable functions in the pupil to sensor or focal plane.
 
 The focal-plane mask is symmetric about both axes, so that pairs of focal samples become cosines and sines. With an
-aperture mask in the relay pupil, the operator from pupil to relay pupil is then real; on the sensor, prolate functions
-of even or odd parity turn the last kernel into a real matrix times 1 (even) or -i (odd), so that the whole operator is
-a real matrix with known phases. Without an aperture mask, the relay is lossless and separable: the real operator ends
+aperture mask in the relay pupil, the operator from pupil to relay pupil is then real. On the sensor, prolate functions
+of even or odd parity turn the last kernel into a real matrix times 1 (even) or -i (odd). The whole operator is then a
+real matrix times these phases. Without an aperture mask, the relay is lossless and separable: the real operator ends
 at the focal plane, and the rest of the path is applied only to the retained modes.
 """
 
@@ -18,7 +18,7 @@ from lowfc.optics.chain.sensor import Sensor
 
 Matrix = Array | Complex
 
-_WIDEST = 0.49  # half bandwidth, cycles per sample; Nyquist is 0.5
+_WIDEST = 0.49  # largest half bandwidth, cycles per sample; the Nyquist frequency is 0.5
 
 
 def prolates(samples: int, half_band: float, count: int) -> Array:
@@ -79,15 +79,15 @@ def field_operator(
 ) -> Array:
     """Real matrix (rows, products) from amplitudes of separable functions in the pupil.
 
-    With an aperture mask, its rows are coefficients of the functions on the sensor. Without, they are the cosine and
-    sine amplitudes of the focal plane within its mask. `on_sensor` propagates either to the sensor.
+    With an aperture mask, the rows are coefficients of the functions on the sensor. Without one, they are the cosine
+    and sine amplitudes in the focal plane, within its mask. `on_sensor` turns either into coefficients on the sensor.
 
     Args:
         sensor: The optics.
         scale: lambda0 / lambda.
         functions: (sensor samples, functions) from `sensor_functions`.
         y_factors: (n, p) factors of the functions along y at the pupil's samples.
-        x_factors: (n, q) factors along x.
+        x_factors: (n, q) factors of the functions along x.
         products: Flat indices into (p, q) of the products to compute.
         advance: Called after each of k / 2 steps, where k is the number of samples across the focal-plane mask.
     """
@@ -116,8 +116,8 @@ def _focal_rows(
     """Focal-plane amplitudes row by row, for amplitudes in the pupil; arguments as for `field_operator`.
 
     Yields:
-        Parity and index of the row, the columns within the mask, and the amplitudes (2 columns, products) there, even
-        and odd along x.
+        Parity and index of the row, the columns within the mask, and the amplitudes (2 columns, products) there: first
+        those even along x, then the odd ones.
     """
     samples, half = sensor.pupil.shape[0], waves.shape[1]
     entering = (x_factors.T[:, None, None] * waves).transpose(3, 1, 2, 0).reshape(samples, -1)
@@ -132,7 +132,7 @@ def _focal_rows(
 
 
 def on_sensor(sensor: Sensor, scale: float, functions: Array, modes: Array) -> Matrix:
-    """Coefficients (functions squared, modes) on the sensor of modes (rows, modes); rows as in `field_operator`.
+    """Coefficients (functions squared, modes) on the sensor for modes (rows, modes); rows as in `field_operator`.
 
     The field at the sensor is F Y F', where F is the functions times `phases` and Y these coefficients. Its squared
     amplitude is in the units of an image.
@@ -162,7 +162,7 @@ def on_sensor(sensor: Sensor, scale: float, functions: Array, modes: Array) -> M
 def _waves(sensor: Sensor, scale: float) -> Array:
     """Cosines and sines (parity, k / 2, n) of the focal samples on the positive half axis.
 
-    Each is scaled by sqrt(2), as it replaces a pair of samples.
+    Each is scaled by sqrt(2), as it stands for a pair of samples.
     """
     half = sensor.focal_mask.shape[0] // 2
     x = image_axis(2 * half, sensor.samples_per)[half:]

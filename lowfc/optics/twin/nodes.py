@@ -7,7 +7,7 @@ from lowfc.optics.chain.grid import pupil_axis
 
 
 def node_axis(nodes: int, order: int) -> Array:
-    """Coordinates of the nodes along an axis, pupil diameters: `nodes` across the pupil, order / 2 guards on each side.
+    """Coordinates (nodes + order,) along an axis, pupil diameters: `nodes` in the pupil, order / 2 guards on each side.
 
     Args:
         nodes: Number of nodes across the diameter; the spacing is 1 / nodes.

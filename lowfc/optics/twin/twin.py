@@ -19,13 +19,13 @@ from lowfc.arrays import Array, Complex, Integers, Single
 
 @dataclass(frozen=True)
 class TwinSpec:
-    """Degree of compression; by default, images differ by less than 1e-4 from the full chain (named sensors).
+    """Degree of compression. By default, the rms error of the named sensors' images is below 1e-4 of the image's rms.
 
-    For other combinations of pupil, focal-plane mask and relay, errors of up to 2e-3 were found.
+    For other combinations of pupil, focal-plane mask and relay, rms errors of up to 2e-3 were found.
 
     Attributes:
         nodes: Pupil nodes across the diameter.
-        order: Number of points of the interpolation from the nodes; even.
+        order: Number of nodes from which a point is interpolated along an axis; even.
         rank: Retained modes of the operator for a focal-plane mask with the area of a disk of radius 4 lambda0 / D and
             an aperture mask. `build` increases it for a larger mask, for a bright pupil, and without an aperture mask.
         guards: Prolate functions along each axis beyond the product of the field's bandwidth and the sensor's width.
@@ -51,7 +51,8 @@ class Operator:
         modes: (rows, rank) orthonormal modes, in the rows of `field_operator`.
         to_modes: (rank, used) real matrix from exp(i phi) at the used nodes to amplitudes of the modes. It includes the
             units of the image.
-        to_coefficients: (functions squared, rank) matrix to coefficients; real with an aperture mask, else complex.
+        to_coefficients: (functions squared, rank) matrix from amplitudes of the modes to coefficients of products of
+            the functions; real with an aperture mask, else complex.
         basis: (points, functions) complex: prolate functions at the points, each times its phase, a power of i.
     """
 
@@ -141,7 +142,7 @@ def response(twin: Twin, basis: NDArray[np.floating], opd_nm: Array | None = Non
 
 
 def projected_response(twin: Twin, projections: Array, opd_nm: Array | None = None) -> Array:
-    """Projections (projections, used) of the image's slope per nm of wavefront at each node.
+    """Projections (projections, used) of the image's change per nm of wavefront at each node.
 
     They are `projections @ response(twin, eye)`, computed from the pixels back to the nodes: the cost depends on the
     number of projections, not on the number of nodes.
@@ -192,7 +193,7 @@ class Evaluator:
 
         Args:
             opds_nm: One wavefront (used,), or several (wavefronts, used), whose images are added.
-            weights: (wavefronts,) weight of each image, at least 0; None for 1.
+            weights: (wavefronts,) weight of each image, at least 0; all 1 when None.
 
         Raises:
             ValueError: A wavefront does not have one value per used node.
@@ -215,7 +216,7 @@ class _Stage:
         to_modes = np.sqrt(operator.weight) * operator.to_modes
         self._to_modes = to_modes.astype(np.float32)
         self._flat_modes = to_modes.sum(axis=1).astype(np.float32)[:, None]
-        # A real matrix multiplies columns of real and of imaginary parts, a complex matrix columns of complex numbers.
+        # A real matrix multiplies columns of real and of imaginary parts; a complex one, columns of complex numbers.
         self._unit = np.dtype(np.complex64 if np.iscomplexobj(operator.to_coefficients) else np.float32)
         self._to_coefficients = np.ascontiguousarray(operator.to_coefficients, self._unit)
         basis, phases = _real_basis(operator.basis)

@@ -19,8 +19,8 @@ from lowfc.optics.twin.field_operator import field_operator, sensor_functions
 from lowfc.optics.twin.nodes import interpolation
 from lowfc.optics.twin.twin import Twin
 
-_FIT_RCOND = 0.01  # least relative singular value of the fit; excludes guard nodes that hardly affect the pupil
-_MIN_SINGULAR_VALUE = 0.01  # relative to the largest; smaller values do not reduce the correction's error
+_FIT_RCOND = 0.01  # smallest relative singular value of the fit; excludes guard nodes that hardly affect the pupil
+_MIN_SINGULAR_VALUE = 0.01  # relative to the largest; smaller ones do not make the correction more accurate
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +31,9 @@ class TwinMirror:
         used: The twin's used nodes.
         y_factors: (axis, rows) influence functions along y, fitted at the nodes.
         x_factors: (axis, columns) influence functions along x, fitted at the nodes.
-        reduce: (significant, rows times columns) effect at the sensor of the surface that the fit omits.
-        expand: (used, significant) smooth surface with the same effect at the sensor.
+        reduce: (significant, rows times columns) matrix from actuators to the effect, at the sensor, of the part of the
+            surface that the fit omits.
+        expand: (used, significant) matrix from this effect to a smooth surface that has the same effect.
     """
 
     used: Integers
@@ -69,7 +70,7 @@ def twin_mirror(sensor: Sensor, twin: Twin, mirror: Mirror) -> TwinMirror:
         y_factors=y_factors.astype(np.float32),
         x_factors=x_factors.astype(np.float32),
         reduce=missing.astype(np.float32),
-        expand=right[significant].astype(np.float32).T,  # column-major: its product takes two thirds of the time
+        expand=right[significant].astype(np.float32).T,  # column-major: products take 2/3 of the row-major time
     )
 
 
