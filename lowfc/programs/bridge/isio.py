@@ -85,7 +85,7 @@ class StepStreams:
     def __init__(self, bus: Bus, clock: Clock, prefix: str) -> None:
         """Write into the streams PREFIX_error, PREFIX_command, PREFIX_residual and PREFIX_flux.
 
-        StreamError if these cannot be names of streams.
+        Raises StreamError if these cannot be names of streams.
         """
         stream_path(f"{prefix}_residual")  # the longest name
         self._ring = bus.ring(STEP, RING_STEPS)
@@ -97,7 +97,7 @@ class StepStreams:
         """Write the steps that have arrived.
 
         Raises:
-            StreamError: another process writes a stream of that name, or it cannot be created.
+            StreamError: another process writes a stream of this name, or the stream cannot be created.
         """
         for sample in self._ring.drain():
             step = step_of(sample)
@@ -119,10 +119,10 @@ class StepStreams:
 
 
 class ExternalChannels:
-    """Sum of other programs' shapes on the mirror, reported to the loop on change, and to a starting controller."""
+    """Sum of other programs' shapes on the mirror, reported to the loop when it changes or a controller starts."""
 
     def __init__(self, client: Client, bus: Bus, names: Sequence[str], nm_per_unit: float) -> None:
-        """Watch these channels, with `nm_per_unit` nm of surface per unit; StreamError for an impossible name."""
+        """Watch these channels, in units of `nm_per_unit` nm of surface; StreamError for an impossible name."""
         self._client = client
         self._states = bus.ring(CONTROLLER_STATE, 1)
         self._nm_per_unit = np.float32(nm_per_unit)
@@ -132,10 +132,10 @@ class ExternalChannels:
         self._others: OtherChannels | None = None  # None until a controller has reported the mirror's grid
         self._controller_shape = b""  # of the channel `external`, as last reported or requested
         self._next_request_s = 0.0
-        self._report = ""
+        self._last_report = ""
 
     def report_changes(self) -> None:
-        """Request a new shape of the controller's channel `external` if the sum differs from the present one."""
+        """Request a new shape for the controller's channel `external` if the sum differs from the channel's shape."""
         for sample in self._states.drain():
             with contextlib.suppress(DecodeError):
                 channels = wire.ControllerState.FromString(sample.payload).channels
@@ -154,13 +154,13 @@ class ExternalChannels:
         except LowfcError as error:
             report = f"not reported to the loop: {error}"
             self._next_request_s = now_s + (_RETRY_S if isinstance(error, RequestRefusedError) else _REQUEST_PERIOD_S)
-        if report != self._report:
-            self._report = report
+        if report != self._last_report:
+            self._last_report = report
             sys.stderr.write(f"other channels: {printable(report)}\n")
 
 
 def _open_or_create(name: str, columns: int) -> Stream:
-    """The stream of one row that this process writes: an existing one, or a new one if it has another size."""
+    """The one-row stream that this process writes: an existing one if its size fits, otherwise a new one."""
     path = stream_path(name)
     with contextlib.suppress(StreamAbsentError):
         stream = Stream(path)

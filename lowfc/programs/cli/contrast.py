@@ -15,20 +15,20 @@ ESTIMATED = ", estimated from the sensor"
 
 
 def added_contrast(contrast: ModalContrast | None, covariance_nm2: Mapping[str, Array | None]) -> dict[str, Any] | None:
-    """Contrast added by wavefronts with these covariances (modes, modes), by name; None for an unknown covariance.
+    """Contrast added by wavefronts with these covariances (modes, modes), by name; None if the covariance is None.
 
     Further keys: `by_group`, the contribution of each group of modes; `beyond_quadratic`, the names for which full
-    images disagree with the quadratic form. The result is None without a `contrast`, without a known covariance, or if
-    the numbers of modes differ.
+    images differ from the quadratic form. The result is None without a `contrast` or without a covariance, or if the
+    numbers of modes differ.
     """
-    known = {name: covariance for name, covariance in covariance_nm2.items() if covariance is not None}
-    if contrast is None or not known or any(len(covariance) != len(contrast.noll) for covariance in known.values()):
+    given_nm2 = {name: covariance for name, covariance in covariance_nm2.items() if covariance is not None}
+    if contrast is None or not given_nm2 or any(len(each) != len(contrast.noll) for each in given_nm2.values()):
         return None
-    by_mode = {name: contrast.by_mode(covariance) for name, covariance in known.items()}
+    by_mode = {name: contrast.by_mode(covariance) for name, covariance in given_nm2.items()}
     return {
         **{name: float(by_mode[name].sum()) if name in by_mode else None for name in covariance_nm2},
         "by_group": {name: by_group(contrast.noll, values) for name, values in by_mode.items()},
-        "beyond_quadratic": [name for name, covariance in known.items() if contrast.is_beyond_quadratic(covariance)],
+        "beyond_quadratic": [name for name, each in given_nm2.items() if contrast.is_beyond_quadratic(each)],
     }
 
 
@@ -52,16 +52,16 @@ def contrast_cases(added: Mapping[str, float]) -> dict[str, float | None]:
 
 
 def contrast_in_words(
-    added: Mapping[str, float | None], most: tuple[str, float] | None, beyond: Sequence[str] = (), how: str = ""
+    added: Mapping[str, float | None], largest: tuple[str, float] | None, beyond: Sequence[str] = (), method: str = ""
 ) -> str:
-    """The added contrast of each case, the modes with the largest share of the last (`most`), and the method (`how`).
+    """Text of the added contrast of each case, of the `largest` contribution to the last case, and of the method.
 
     A caveat names the cases in `beyond`, for which full images differ from the quadratic form.
     """
     cases = ", ".join(f"{name} {value:+.1e}" for name, value in added.items() if value is not None)
-    largest = "" if most is None else f"; {most[0]} contributes most ({100 * most[1]:.0f} %)"
+    share = "" if largest is None else f"; {largest[0]} contributes most ({100 * largest[1]:.0f} %)"
     caveat = f"; full images differ from the quadratic form by more than 10 %: {', '.join(beyond)}" if beyond else ""
-    return f"added to the dark zone's contrast: {cases}{largest}{how}{caveat}"
+    return f"added to the dark zone's contrast: {cases}{share}{method}{caveat}"
 
 
 def added_contrast_in_words(result: Mapping[str, Any]) -> str:

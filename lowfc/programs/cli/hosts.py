@@ -42,7 +42,7 @@ class HostsResult(Result):
     processes: list[HostProcess] = result_field("processes")
 
     def remarks(self) -> list[str]:
-        """The reason if no clock is compared."""
+        """Why no clock is compared, if none is."""
         compared = any(each.clock_offset_us is not None for each in self.processes)
         return [] if compared else ["no clock is compared: the run has no router, or its router reports no clock"]
 
@@ -57,7 +57,7 @@ def certs(
     ] = None,
     mirror: Annotated[
         list[str] | None,
-        typer.Option(help="Name of a mirror; may be repeated. Default: those in the folder, or dm."),
+        typer.Option(help="Name of a mirror; may be repeated. Default: those with certificates in the folder, or dm."),
     ] = None,
     days: Annotated[int, typer.Option(min=1, max=3650, help="Validity of the certificates, days.")] = 825,
     renew: Annotated[

@@ -25,7 +25,7 @@ class Commands(Mapping[str, Any]):
     """Commands by name; each is imported when it is looked up."""
 
     def __init__(self, rows: Sequence[Row], group_commands: Sequence[Row]) -> None:
-        """`rows` are the commands and groups; `group_commands` are named "GROUP COMMAND"."""
+        """`rows` are the commands and groups; `group_commands`, named "GROUP COMMAND", are those of the groups."""
         self._rows, self._group_commands = {row.name: row for row in rows}, group_commands
 
     def __getitem__(self, name: str) -> Any:
@@ -58,7 +58,7 @@ def lazy_app(help_text: str, panels: Mapping[str, Sequence[Row]], group_commands
     Args:
         help_text: text at the head of `--help`.
         panels: commands by the heading under which `--help` lists them.
-        group_commands: commands of the groups among them, named "GROUP COMMAND".
+        group_commands: commands of the groups in `panels`, named "GROUP COMMAND".
     """
     rows = [row for panel in panels.values() for row in panel]
     width = max(len(row.name) for row in rows)

@@ -16,12 +16,12 @@ HIGHEST = 1000
 """Highest Noll index accepted, far above any controlled mode."""
 
 
-def noll_of(words: Sequence[str] | None) -> tuple[int, ...]:
-    """Noll indices of words such as "2,3" and "4-11", without duplicates; empty (all modes) without words."""
-    if not words:
+def noll_of(arguments: Sequence[str] | None) -> tuple[int, ...]:
+    """Noll indices of arguments such as "2,3" and "4-11", without duplicates; without arguments empty: all modes."""
+    if not arguments:
         return ()
     indices: list[int] = []
-    joined = ",".join(words).replace(" ", "")
+    joined = ",".join(arguments).replace(" ", "")
     parts = [part for part in joined.split(",") if part]
     for part in parts or [joined]:  # commas alone are refused
         first, dash, last = part.partition("-")

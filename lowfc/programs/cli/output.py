@@ -9,5 +9,5 @@ from lowfc.contract.printable import LINES, printable
 
 
 def print_result(result: Mapping[str, Any], text: str, *, as_json: bool) -> None:
-    """Print a result as one JSON object, or its text for a person; control characters in the text are escaped."""
+    """Print a result as one JSON object, or print its text; control characters in the text are escaped."""
     sys.stdout.write((json.dumps(result) if as_json else printable(text, keep=LINES)) + "\n")

@@ -1,4 +1,4 @@
-"""Typed result of a command: the source of both its `--json` object and its text.
+"""Typed result of a command: the source of both the `--json` object and the text.
 
 `result_field` declares a field with label, unit and format. The text has a line for each labelled field, then a table
 for each list of nested results; fields declared as columns have the same length and share one table.
@@ -63,7 +63,7 @@ class Result(BaseModel):
 
 
 def parts_table(parts: Sequence[Result]) -> list[str]:
-    """Table with a row for each part, a column for each labelled field, and the part's remarks after its row."""
+    """Table with a row for each part and a column for each labelled field; a part's remarks follow its row."""
     shown = [(name, info) for name, info in type(parts[0]).model_fields.items() if info.description]
     rows = [[formatted(info, getattr(part, name)) for name, info in shown] for part in parts]
     lines = table([_heading(info) for _, info in shown], rows)
@@ -82,7 +82,7 @@ def table(headings: Sequence[str], rows: Any) -> list[str]:
 
 
 def formatted(info: FieldInfo, value: Any, *, with_unit: bool = False) -> str:
-    """The value of a field as text; a dash for none."""
+    """The value of a field as text; a dash for None."""
     if value is None:
         return "-"
     if isinstance(value, bool):

@@ -35,7 +35,7 @@ def _row(name: str, roles: set[str]) -> dict[str, Any]:
     """State of a run from the Health of its processes; a process that has not sent one yet is starting."""
     with Client(name) as loop:
         alive = loop.processes()
-    roles = set(alive) if open_run(name, ()).links.network.router else roles  # only the router listens, if there is one
+    roles = set(alive) if open_run(name, ()).links.network.router else roles  # with a router, only the router listens
     controller, recorder = alive.get(Role.CONTROLLER, NO_HEALTH), alive.get(Role.RECORDER, NO_HEALTH)
     starting = [{"process": role, "state": "starting", "pid": None} for role in roles - {*alive, Role.LAUNCHER}]
     processes = [{"process": key, "state": health.state, "pid": health.pid} for key, health in alive.items()]

@@ -23,7 +23,7 @@ NO_HEALTH = wire.Health()
 def json_object(
     state: wire.ControllerState, processes: Mapping[str, wire.Health] = MappingProxyType({}), run: str = ""
 ) -> dict[str, Any]:
-    """The state as `lowfc ctl status --json` prints it; modes in the calibration's order, nm rms of wavefront."""
+    """The state as `lowfc ctl status --json` prints it; lists by mode are in the calibration's order."""
     playing = None
     if state.HasField("play"):
         play = state.play
@@ -112,7 +112,7 @@ def json_object(
         "interlocks_configured": len(settings.interlocks),
         "limits_hit": [reason_name(reason) for reason in state.limits_hit],
         "refused": reason_name(state.refused) if state.refused else None,
-        "counts": {reason_name(line.reason): line.count for line in state.counts},
+        "counts": {reason_name(each.reason): each.count for each in state.counts},
         "stroke_nm": settings.stroke_nm,
         "slew_nm": settings.slew_nm,
         "neighbour_nm": settings.neighbour_nm,
@@ -162,7 +162,7 @@ def _contrast_row(status: dict[str, Any]) -> dict[str, str]:
         return {}
     source = ESTIMATED if status["added_contrast_estimated"] else ""
     cases = contrast_cases(status["added_contrast"])
-    return {"contrast": contrast_in_words(cases, costliest_modes(status), how=source + QUADRATIC)}
+    return {"contrast": contrast_in_words(cases, costliest_modes(status), method=source + QUADRATIC)}
 
 
 def law_in_words(status: dict[str, Any]) -> str:
@@ -192,7 +192,7 @@ def interlocks_in_words(status: dict[str, Any]) -> str:
 
 
 def holds_shape(state: wire.ControllerState | None) -> bool:
-    """Whether an offset or a channel other than `flat` is set: the true wavefront contains it besides the residual."""
+    """Whether an offset or a channel other than `flat` is set: the true residual then contains its shape, too."""
     return state is not None and (any(state.offset_nm) or any(one.name != FLAT for one in state.channels))
 
 
@@ -206,9 +206,9 @@ def recording_state(recorder: wire.Health) -> str:
 
 
 def _summary_line(status: dict[str, Any]) -> str:
-    """Mode, residual and flux of the last second, lost frames, recording, run, law, last warning.
+    """One line: mode, residual and flux of the last second, lost frames, recording, run, law, last warning.
 
-    The true residual is over the simulated camera's last two seconds; lost frames are counted from the controller's
+    The true residual is that of the simulated camera's last two seconds; lost frames are counted from the controller's
     start.
     """
     measured = ["no frame used in the last second"]
@@ -239,7 +239,7 @@ def _summary_line(status: dict[str, Any]) -> str:
 
 
 def _last_warning(state: wire.ControllerState, processes: Mapping[str, wire.Health]) -> dict[str, Any] | None:
-    """The newest warning; if a mirror's driver failed, that mirror's newest, because the failure causes the others."""
+    """The newest warning; if a mirror's driver failed, the mirror's newest one, as the failure causes the others."""
     warnings = [
         (from_timestamp(one.last_warning_timestamp), name) for name, one in processes.items() if one.last_warning
     ]
@@ -275,7 +275,7 @@ def _limits_in_words(limits: list[str]) -> str:
 
 
 def _count_text(reason: str, count: int) -> str:
-    """Text of how often a frame was refused for a reason or a limit acted."""
+    """Text of a count: how often frames were refused for a reason, or a limit acted."""
     if reason == Rejection.NO_FRAME.name:
         return f"no frame {counted(count, 'time')}"
     if reason in Rejection.__members__:
