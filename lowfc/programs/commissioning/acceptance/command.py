@@ -34,8 +34,8 @@ def rejection(
     context: typer.Context,
     logs: LogsIfAny = None,
     duration: Annotated[float, typer.Option(min=0.1, max=1e5, help="Seconds of the multisine.")] = 60.0,
-    rms_nm: Annotated[float, typer.Option(min=1e-3, max=1e3, help="Wavefront rms of each mode, nm.")] = 5.0,
-    lines: Annotated[int, typer.Option(min=1, max=1000, help="Number of frequencies in each mode.")] = 12,
+    rms_nm: Annotated[float, typer.Option(min=1e-3, max=1e3, help="Rms of the multisine in each mode, nm.")] = 5.0,
+    lines: Annotated[int, typer.Option(min=1, max=1000, help="Number of multisine frequencies in each mode.")] = 12,
     modes: Modes = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the multisine's phases.")] = 1,
     config: Required = None,
@@ -43,7 +43,7 @@ def rejection(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Measure rejection and noise transfer under a multisine, and compare them with theory.
+    """Measure rejection and noise transfer with a multisine, and compare them with theory.
 
     Example: lowfc acceptance rejection --duration 60 --plot rejection.png
     """
@@ -139,8 +139,8 @@ def _carry_out(
     if logs:
         for option in options_set(context):
             if option not in ("logs", "--config", "--plot", "--json"):
-                raise ConfigurationError(f"{option} is for a test of a running loop, but a log is evaluated: omit it")
-    required = {} if config is None else {"acceptance": configuration(config).acceptance}
+                raise ConfigurationError(f"{option} has no effect on the evaluation of a log: omit it")
+    requirements = {} if config is None else {"acceptance": configuration(config).acceptance}
     require_folder(plot)
     # if matplotlib is missing, the error comes before the test, not after it
     figure = None if plot is None else figure_class()(figsize=(10, 5), layout="constrained")
@@ -152,11 +152,11 @@ def _carry_out(
         responses = logged_responses(history, test.KIND)
         if history.configuration is None:
             raise DataFileError(f"{log.path}: has no configuration, so camera and requirements are unknown")
-        config_in_use = history.configuration.model_copy(update=required)
+        config_in_use = history.configuration.model_copy(update=requirements)
     else:
         with Client(run) as client, counting_bar(Console(stderr=True), TimeRemainingColumn()) as count:
             live = Live(client, partial(count, test.KIND), partial(print, file=sys.stderr))
-            config_in_use = live.configuration = live.configuration.model_copy(update=required)
+            config_in_use = live.configuration = live.configuration.model_copy(update=requirements)
             with client.reserved("lowfc acceptance"), live.restored():
                 responses = play(live)
     result = test.judge(responses, config_in_use)

@@ -1,4 +1,4 @@
-"""Control of the live loop by the acceptance tests: probe sequences announced in its log, mode restored afterwards."""
+"""Control of the live loop by the acceptance tests: probe sequences, announced by notes in the loop's log."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -26,8 +26,8 @@ from lowfc.programs.commissioning.acceptance.probe import (
 from lowfc.programs.commissioning.calibrate.recording import await_mirror
 
 ATTEMPTS = 3
-"""Attempts to play a probe sequence; if mirror or camera interrupt each of them, the test ends with an error."""
-_OTHER_BYTES = 1000  # bytes of a request to play, without its table and shapes
+"""Attempts to play a probe sequence; if mirror or camera interrupt every attempt, the test ends with an error."""
+_OTHER_BYTES = 1000  # bytes of a request to play besides its table and shapes
 _LAW_FIELDS = ("gain", "leak", "limit_nm", "law", "calibration_id")
 
 
@@ -35,7 +35,7 @@ class Live:
     """The live loop; `restored` stops probe sequences and restores the mode at the end."""
 
     def __init__(self, client: Client, progress: Callable[[int, int], None], report: Callable[[str], object]) -> None:
-        """Read calibration, configuration and mode of the loop; AcceptanceError unless it is open or closed."""
+        """Read calibration, configuration and mode of the loop; AcceptanceError unless the loop is open or closed."""
         self.client = client
         self.calibration = client.calibration()
         self.configuration = configuration_of(client)
@@ -49,7 +49,7 @@ class Live:
 
     @contextmanager
     def restored(self) -> Iterator[None]:
-        """Restore the loop mode at the end, also after an exception; safe mode stays."""
+        """At the end, also after an exception, stop a probe sequence and restore the loop mode; safe mode stays."""
         try:
             yield
         finally:
@@ -68,7 +68,7 @@ class Live:
         self._done += frames
 
     def set_mode(self, mode: LoopMode) -> None:
-        """Open or close the loop unless it is in that mode already; after closing, wait until it has settled."""
+        """Open or close the loop unless it is in this mode already; after closing it, wait until it has settled."""
         if LoopMode(self._state().mode) is not mode:
             if mode is LoopMode.OPEN:
                 self.client.open_loop()
@@ -78,7 +78,7 @@ class Live:
             self.wait(takeover + self.loop.settling_frames())
 
     def return_to_zero(self) -> None:
-        """Open the loop, reset the command and wait until it is zero."""
+        """Open the loop, reset the command and wait until the command is zero."""
         self.client.stop()
         self.client.open_loop()
         self.client.reset()
@@ -92,7 +92,7 @@ class Live:
             pass
 
     def check_length(self, frames: int, columns: int, basis: Single | None) -> None:
-        """AcceptanceError if a table of this size is too large for a request with these shapes."""
+        """Raise AcceptanceError if a table of this size, with the shapes `basis`, is too large for a request."""
         shape_bytes = 0 if basis is None else basis.nbytes
         most_frames = (max_bytes("play") - _OTHER_BYTES - shape_bytes) // (4 * max(columns, 1))
         if columns and frames > most_frames:
@@ -102,10 +102,10 @@ class Live:
     def play(
         self, kind: Kind, parameters: dict[str, Any], mode: LoopMode, table: Single, basis: Single | None = None
     ) -> ProbeResponse:
-        """Play a table and return the loop's response; without shapes in `basis` the table is added to the offset.
+        """Play a table and return the loop's response; without shapes (`basis`) the table is added to the offset.
 
         A table without columns adds no probe: only the steps are recorded. AcceptanceError if the table is too large
-        for a request, gains or law changed, or the mirror or the camera interrupted all `ATTEMPTS` plays.
+        for a request, gains or law changed, or the mirror or the camera interrupted all `ATTEMPTS` attempts.
         """
         self.check_length(frames := len(table), table.shape[1], basis)
         self.set_mode(mode)
@@ -124,7 +124,7 @@ class Live:
     def _play_once(
         self, kind: Kind, parameters: dict[str, Any], mode: LoopMode, table: Single, basis: Single | None
     ) -> tuple[ProbeResponse, str]:
-        """Play a table once; return the response, and what interrupted the play, empty if nothing did."""
+        """Play a table once; return the response, and what interrupted the probe sequence, empty if nothing did."""
         frames, columns = table.shape
         before = self._state()
         steps, watch = self.client.steps(), self.client.mirror_watch()

@@ -28,7 +28,7 @@ _LOOPS = {"open": LoopMode.OPEN, "closed": LoopMode.CLOSED}
 
 
 class NoiseMode(ModeResult):
-    """White noise of a mode per frame, and the residual it causes in closed loop, nm rms of wavefront."""
+    """White noise of a mode per frame, and the residual that this noise causes in closed loop, nm rms of wavefront."""
 
     expected_nm: float = result_field("expected", "nm", ".3f")
     open_nm: float = result_field("open", "nm", ".3f")
@@ -41,7 +41,7 @@ class NoiseMode(ModeResult):
 class NoiseResult(AcceptanceResult):
     """Noise floor of every mode."""
 
-    noise_ratio: float = result_field("required noise / expected", form="g")
+    noise_ratio: float = result_field("limit of noise / expected", form="g")
     law: str = result_field("law")
     frames: dict[str, int] = result_field()
     added_contrast: dict[str, Any] | None = result_field()
@@ -54,7 +54,7 @@ class NoiseResult(AcceptanceResult):
 
 
 def play(live: Live, *, duration_s: float) -> list[ProbeResponse]:
-    """Record the loop without a probe: open, then closed, each for `duration_s`."""
+    """Record the loop without a probe: open, then closed, each for `duration_s` or at least `SHORTEST` frames."""
     frames = max(round(duration_s * live.loop.rate_hz), SHORTEST)
     live.expect(frames * len(_LOOPS))
     no_probe = np.zeros((frames, 0), np.float32)
@@ -62,7 +62,7 @@ def play(live: Live, *, duration_s: float) -> list[ProbeResponse]:
 
 
 def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> NoiseResult:
-    """Evaluate the noise of both recordings; AcceptanceError if one is missing, too short, or was disturbed."""
+    """Evaluate the noise of both recordings; AcceptanceError if one is missing, too short or disturbed."""
     by_loop = {response.parameters["loop"]: response for response in responses}
     if set(by_loop) != set(_LOOPS):
         raise AcceptanceError(
@@ -108,7 +108,7 @@ def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> N
 
 
 def draw(result: dict[str, Any], figure: Any) -> None:
-    """Draw measured and expected noise of each mode, and the residual that it causes."""
+    """Draw measured and expected noise of each mode, and the residual that the noise causes."""
     ax = figure.subplots()
     x = np.arange(len(result["modes"]))
     for name, label, marker in (

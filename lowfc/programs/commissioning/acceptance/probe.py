@@ -1,6 +1,6 @@
 """Probe sequences of the acceptance tests, the loop's steps during them, and the base classes of the results.
 
-A note with the parameters of the test precedes each probe sequence, so that a log is evaluated like the live loop.
+A note with the test's parameters precedes each probe sequence, so that a log can be evaluated like the live loop.
 """
 
 import json
@@ -32,21 +32,22 @@ from lowfc.programs.cli.result import Result, result_field
 Kind = Literal["rejection", "linearity", "capture-range", "noise-floor"]
 
 LIMITS = (Limit.MODAL_LIMIT, Limit.STROKE, Limit.SLEW, Limit.NEIGHBOUR)
+"""Limits that end a measurement when they act."""
 MAX_MISSING = 0.01
-"""Largest fraction of the frames that may be missing or refused."""
+"""Largest fraction of a measurement's frames that may be missing or refused."""
 _LIMIT_BITS = sum(1 << limit for limit in LIMITS)
 
 ANNOUNCEMENT = "acceptance "
-"""First word of a note that announces a test; its parameters follow as JSON."""
+"""First word of a note that announces a test; the test's parameters follow as JSON."""
 _ANNOUNCED: dict[Kind, dict[str, Any]] = {
     "rejection": {"period_frames": 0},
     "linearity": {"noll": 0, "averaged": 0},
     "capture-range": {"noll": 0, "level_nm": 0.0, "before": [0, 0], "after": [0, 0]},
     "noise-floor": {"loop": ""},
 }
-"""The parameters of each test; only the types of the values matter."""
+"""The parameters of each test; only the types of the values are used."""
 _DISTURBING = ("gain", "leak", "limit", "law", "load", "offset", "channel", "reset", "stop")
-"""Requests that make a measurement unusable."""
+"""Requests that make a measurement unusable if they are accepted during it."""
 
 
 class AcceptanceError(LowfcError):
@@ -124,7 +125,7 @@ class ProbeResponse:
         pol_nm: pseudo-open-loop modes (frames, modes); NaN as in `error_nm`.
         command_nm: modal command (frames, modes) after each frame; NaN where the frame is missing.
         mode: loop mode (frames,), 0 where a frame is missing.
-        reasons: bit `1 << reason` for each reason of a frame (frames,).
+        reasons: for each frame (frames,), bit `1 << reason` of each reason why it was refused or a limit acted.
     """
 
     parameters: dict[str, Any]
@@ -173,7 +174,7 @@ class ProbeResponse:
 
 
 def selected_modes(requested: Sequence[int], noll: Sequence[int]) -> tuple[int, ...]:
-    """The requested Noll indices, by default all; AcceptanceError if the loop does not control one of them."""
+    """The requested Noll indices, all if there are none; AcceptanceError if the loop does not control one of them."""
     unknown = sorted(set(requested) - set(noll))
     if unknown:
         raise AcceptanceError(f"Noll modes {unknown} are not controlled; the loop controls {', '.join(map(str, noll))}")
@@ -181,7 +182,7 @@ def selected_modes(requested: Sequence[int], noll: Sequence[int]) -> tuple[int, 
 
 
 def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
-    """The probe sequences of a test in a log; DataFileError if there are none or the loop was changed meanwhile."""
+    """The loop's responses to a test in a log; DataFileError if there are none or a request disturbed the test."""
     path, calibration = history.log.path, history.calibration
     announced = _announced(history.requests, kind)
     if calibration is None or not announced:
@@ -266,7 +267,7 @@ def _types(value: object) -> object:
 def probe_response(
     parameters: dict[str, Any], loop: Loop, target: str, table: Single, first: int, steps: Steps
 ) -> ProbeResponse:
-    """The steps of a probe sequence from frame `first` on, one row per frame; the rate is measured from these steps."""
+    """The steps of a probe sequence from frame `first` on, one row per frame; the frame rate is that of these steps."""
     frames = len(table)
     new = (steps.reasons & (1 << Rejection.REPEATED | 1 << Rejection.OUT_OF_ORDER)) == 0
     steps = steps.at(new & (steps.sequence >= first) & (steps.sequence < first + frames))

@@ -1,4 +1,7 @@
-"""`lowfc acceptance rejection`: the loop's measured rejection and noise transfer functions compared with theory."""
+"""`lowfc acceptance rejection`: the loop's measured rejection and noise transfer functions compared with theory.
+
+They are measured with a multisine; its frequencies are called lines. Each mode has lines of its own.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -30,15 +33,15 @@ from lowfc.programs.commissioning.acceptance.probe import (
 
 KIND: Kind = "rejection"
 MIN_JUDGED = 0.5
-"""Smallest fraction of a mode's lines whose rejection must be certain enough to judge.
+"""Smallest fraction of a mode's lines at which the rejection must be certain enough to judge.
 
 The noise transfer has no such limit: where it is small, it is below the measurement noise.
 """
-_LEAD_FRAMES = 50  # frames before the period, besides those of settling: the bus delivers the first steps late
+_LEAD_FRAMES = 50  # frames before the period, added to those of settling: the bus delivers the first steps late
 
 
 class Comparison(Result):
-    """Departure of a mode's transfer function from theory, on the lines that can be judged."""
+    """Departure of a mode's transfer function from theory, at the lines that can be judged."""
 
     within: bool = result_field()
     lines: int = result_field()
@@ -52,16 +55,16 @@ class Comparison(Result):
 
 
 class RejectionMode(ModeResult):
-    """Departure of a mode's rejection and noise transfer from theory, dB, and the number of lines judged."""
+    """Departure of a mode's rejection and noise transfer from theory, dB, each at the lines that can be judged."""
 
     rejection: Comparison = result_field("rejection", "dB on lines")
     noise_transfer: Comparison = result_field("noise transfer", "dB on lines")
 
 
 class RejectionResult(AcceptanceResult):
-    """Rejection and noise transfer under a multisine; `points` has one entry per line.
+    """Rejection and noise transfer measured with a multisine; `points` has one entry per line.
 
-    The largest departures are absolute values over all modes; `lines_judged` counts lines whose rejection is judged.
+    The largest departures are absolute values, of all modes; `lines_judged` counts lines whose rejection is judged.
     """
 
     law: str = result_field("law")
@@ -81,7 +84,7 @@ class RejectionResult(AcceptanceResult):
     points: list[dict[str, Any]] = result_field()
 
     def remarks(self) -> Sequence[str]:
-        """Lines too noisy to judge, missing frames, and the verdict."""
+        """Lines at which the rejection is too noisy to judge, number of missing frames, and the verdict."""
         lines = [
             f"Z{mode.noll}: rejection too noisy to judge at "
             f"{', '.join(f'{frequency:.3g}' for frequency in mode.rejection.unsure_hz)} Hz"
@@ -106,7 +109,7 @@ def play(
     Args:
         live: The loop, and the requirements in its configuration.
         duration_s: Period of the multisine.
-        rms_nm: Rms of each mode.
+        rms_nm: Rms of the multisine in each mode, nm of wavefront.
         lines_per_mode: Number of lines of each mode.
         modes: Noll indices; empty for all.
         seed: Seed of the phases.
@@ -131,7 +134,7 @@ def play(
 
 
 def transfer_function(response: ProbeResponse) -> Lines:
-    """Measured transfer functions on the lines of the multisine; AcceptanceError if the loop was disturbed."""
+    """Transfer functions measured at the lines of the multisine; AcceptanceError if the loop was disturbed."""
     response.check(LoopMode.CLOSED)
     if Limit.LAW_OVERRULED in count_reasons(response.reasons):
         raise AcceptanceError(
