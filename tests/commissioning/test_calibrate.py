@@ -189,7 +189,7 @@ def test_errors_say_why_a_calibration_is_impossible(monkeypatch: pytest.MonkeyPa
     loop = InProcessLoop(configured(**FEW))
     with pytest.raises(CalibrationError, match="at most 3 nm of each"):
         calibrator_of(loop, "hadamard", amplitude_nm=5.0)
-    with pytest.raises(CalibrationError, match="slew limit; at most"):
+    with pytest.raises(CalibrationError, match="slew limit; give at most"):
         calibrator_of(loop, "poke", amplitude_nm=500.0)
     lossy = InProcessLoop(configured(**NOISELESS), lose=lambda index: index % 50 == 49)
     with pytest.raises(CalibrationError, match="in 2 attempts there were no 240 consecutive frames"):

@@ -1,4 +1,4 @@
-"""The analytic calibration of a configured instrument; its optical model is built with a progress bar, and cached."""
+"""The analytic calibration of a configured instrument; the optical model is built with a progress bar, and cached."""
 
 from collections.abc import Callable
 
@@ -15,10 +15,10 @@ from lowfc.optics.detector.detector import expose
 from lowfc.optics.twin.twin import Twin
 from lowfc.optics.twin.twin_mirror import TwinMirror
 
-_FRAMES = 100  # simulated frames, whose flux in DN is compared with that of the light on the detector
+_FRAMES = 100  # number of simulated frames; their flux in DN is compared with that of the light on the detector
 
 _MIN_REACH = 0.1
-"""Least amplitude that the stroke must allow, as a fraction of the modal limit, or of the stroke if that is smaller."""
+"""Smallest amplitude that the stroke must allow, relative to the modal limit, or to the stroke if that is smaller."""
 
 WavefrontFunction = Callable[[Twin, TwinMirror], Array]
 """Computes the wavefront at the used nodes, nm, from a twin and the mirror on its nodes."""

@@ -1,4 +1,4 @@
-"""Tables of checks of a host or a device, their results, and the report as text or JSON."""
+"""Tables of checks of a host or a device, results of checks, and the report as text or JSON."""
 
 import json
 import sys
@@ -30,7 +30,7 @@ class Check(NamedTuple):
     """One line of a report.
 
     Attributes:
-        status: wrong: violates the contract; warning: has a cost or could not be tested; note: for information.
+        status: wrong: the contract is violated; warning: there is a cost, or no test was possible; note: information.
         got: result of the check.
         advice: recommended action; empty if none is needed.
         cost: consequence of ignoring the advice.
@@ -47,7 +47,7 @@ class Check(NamedTuple):
 
 
 Severity = Callable[[str, str], Check]
-"""Function that makes a Check from a finding and advice: `note`, `warning` or `wrong`."""
+"""`note`, `warning` or `wrong`: makes a Check from a result and advice."""
 
 
 def ok(got: str) -> Check:
@@ -56,12 +56,12 @@ def ok(got: str) -> Check:
 
 
 def note(got: str, advice: str = "", cost: str = "") -> Check:
-    """A finding for information."""
+    """A result for information."""
     return Check(Status.NOTE, got, advice, cost)
 
 
 def warning(got: str, advice: str = "", cost: str = "") -> Check:
-    """A finding that has a cost, or a check that could not be carried out."""
+    """A result that has a cost, or a check that could not be carried out."""
     return Check(Status.WARNING, got, advice, cost)
 
 
@@ -73,7 +73,7 @@ def wrong(got: str, advice: str) -> Check:
 def judged(
     name: str, expected: str, good: bool, got: str, advice: str, got_if_bad: str = "", severity: Severity = wrong
 ) -> Check:
-    """A named check: `ok(got)` if good; otherwise `severity` of `got_if_bad`, by default `got`, and the advice."""
+    """A named check: `ok(got)` if good, otherwise `severity(got_if_bad or got, advice)`."""
     check = ok(got) if good else severity(got_if_bad or got, advice)
     return check._replace(name=name, expected=expected)
 

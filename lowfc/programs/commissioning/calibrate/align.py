@@ -25,11 +25,11 @@ from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
 from lowfc.programs.commissioning.calibrate.tasks import reporter, write
 
 MIN_CORRELATION = 0.5
-"""Smallest correlation of a poke's image with the computed image; below it the sensor is not the configured one."""
+"""Smallest mean correlation of pokes' images with the computed ones; below it the sensor is not the configured one."""
 
 
 class AlignResult(Result):
-    """Geometry of the sensor relative to the computed image."""
+    """Placement of the sensor's image relative to the computed one, and how well the images agree."""
 
     pixels_per_lambda_d: float = result_field("scale", "pixels per lambda/D", ".4f")
     scale: float = result_field()
@@ -49,7 +49,7 @@ class AlignResult(Result):
 
 
 def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResult:
-    """Fit the sensor's geometry and write the computed calibration for its pixels; CalibrationError without a fit."""
+    """Fit the sensor's geometry, and write the computed calibration for its pixels; CalibrationError without a fit."""
     require_folder(out)
     console = Console(stderr=True)
     with Client(run) as loop, loop.reserved("lowfc calibrate align"):
@@ -88,9 +88,9 @@ def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> Alig
 
 
 def on_sensor(config: Configuration, computed: Calibration, geometry: Geometry, in_use: Calibration) -> Calibration:
-    """The computed calibration on the pixels of a real sensor, with flux, dark and mask of the calibration `in_use`.
+    """The computed calibration on the pixels of a real sensor, with flux, dark and good pixels of `in_use`.
 
-    CalibrationError if the good pixels see too little of the image.
+    CalibrationError if too little of the image falls on the good pixels.
     """
     shape, pixels = (*computed.shape, -1), in_use.good.size  # shape: rows, columns, modes
     I0 = onto(computed.reference.astype(np.float64).reshape(computed.shape), geometry, in_use.shape).reshape(-1)
@@ -125,7 +125,8 @@ def oriented(
 ) -> tuple[Alignment, Calibration, float]:
     """Choose the orientation that fits pokes of tip, and of tilt if needed, among those that the image allows.
 
-    `poke` measures the response to the mode of an index; `alignment` is the image's fit; the others as for `on_sensor`.
+    `poke(k)` measures the response (pixels,) to mode k; `alignment` is the fit of the image. Other arguments as for
+    `on_sensor`.
 
     Returns:
         The alignment, its calibration, and the mean correlation of measured with computed responses.
@@ -152,17 +153,17 @@ def oriented(
 
 
 def computed_scale(config: Configuration) -> float:
-    """Pixels per lambda/D of the computed image; per pupil diameter for a pupil-plane sensor."""
+    """Pixels of the computed image per lambda/D; for a pupil-plane sensor, per pupil diameter."""
     optics = factory.sensor(config, lambda _: None)
     return 1 / (optics.pitch * optics.binning)
 
 
 def geometry_in_words(alignment: Alignment, scale: float) -> str:
-    """Text of the image's geometry and its residual; `scale` in pixels per lambda/D."""
+    """Text of the image's geometry and of the fit's residual; `scale` in pixels per lambda/D."""
     geometry = alignment.geometry
     return (
         f"{scale:.4f} pixels per lambda/D, centre at row {geometry.row:.2f}, column "
         f"{geometry.column:.2f}, rotation {geometry.rotation_deg:.2f} degrees, "
-        f"{'reflected' if geometry.parity < 0 else 'not reflected'}; {alignment.residual:.1%} of the image differs "
-        f"from the computed one ({alignment.other_parity:.1%} with the other parity)"
+        f"{'reflected' if geometry.parity < 0 else 'not reflected'}; the image differs from the computed one by "
+        f"{alignment.residual:.1%} rms ({alignment.other_parity:.1%} with the other parity)"
     )

@@ -25,7 +25,7 @@ Frames = Annotated[int, typer.Option(min=16, max=100_000, help="Number of frames
 @calibrate_app.callback(invoke_without_command=True)
 def calibrate(
     context: typer.Context,
-    method: Annotated[Method, typer.Option(help="Method of measuring or computing H.")] = "hadamard",
+    method: Annotated[Method, typer.Option(help="Method by which H is measured or computed.")] = "hadamard",
     out: Out = Path("calibration.fits"),
     run: AnyRun = None,
     config: ConfigFile = None,
@@ -68,7 +68,7 @@ def calibrate(
 ) -> None:
     """Calibrate a running loop by poking its mirror, or compute its calibration.
 
-    The measured calibration is checked on separate frames. If it is not recommended, it is written as
+    The measured calibration is checked with separate frames. If it is not recommended, it is written as
     NAME.rejected.fits and not loaded, and the exit status is 1.
 
     The mirror returns to its previous shape, also after Ctrl-C; --resume then continues after the completed cycles.
@@ -132,7 +132,7 @@ def dark(
     load: Load = False,
     as_json: Json = False,
 ) -> None:
-    """Take a dark and find bad pixels; write the calibration in use with the new dark and mask.
+    """Measure the dark and find bad pixels; write the calibration in use with the new dark and bad pixels.
 
     Block the star first.
 
@@ -175,7 +175,7 @@ def align(
     load: Load = False,
     as_json: Json = False,
 ) -> None:
-    """Fit how the sensor is placed relative to the computed image; write the computed calibration for its pixels.
+    """Fit how the sensor is placed relative to the computed image; compute and write a calibration for its pixels.
 
     A rotation by 180 degrees does not change the image but reverses tip and tilt: a poke resolves the ambiguity.
 

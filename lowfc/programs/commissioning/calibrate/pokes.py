@@ -20,23 +20,23 @@ AMPLITUDE_NM = {"poke": 8.0, "hadamard": 3.0, "in-loop": 2.0}
 MIN_SNR = 20.0
 """Signal-to-noise ratio required by default if the number of cycles is given."""
 FULL_AMPLITUDE_SNR = 70.0
-"""Signal-to-noise ratio above which the default amplitude is reduced: relative errors grow as the amplitude squared."""
+"""Signal-to-noise ratio above which the default amplitude is reduced: errors of linearity grow as its square."""
 MAX_HADAMARD_NM = 3.0
 """Largest amplitude of a mode, nm rms: all modes at once add up to some four times that, within the linear range."""
 SETTLE = 2
-"""Frames left out after each change: one for a fractional delay, and one for a late command."""
+"""Unused frames after each change: one for a fractional delay, and one for a late command."""
 HOLD = 4
-"""Frames for which each poke is held."""
+"""Used frames of each push or pull."""
 DITHER_HOLD = 2
-"""Frames for which each value of a dither is held: the longer, the more of it the loop corrects."""
+"""Frames for which each value of a dither is held; the loop corrects more of a dither that is held longer."""
 PIECE = 1024
 """Length of a piece of a dither, frames."""
 MARGIN = 0.9
-"""Error to aim for, as a fraction of the required one, so that scatter of the cycles seldom requires more cycles."""
+"""Error for which cycles are planned, relative to the required error, so that scatter seldom requires more cycles."""
 MAX_CYCLES_RATIO = 4
-"""Largest ratio of cycles to the number required by photon and read noise; beyond it the operator decides."""
+"""Largest ratio of cycles to the number required by photon and read noise; the operator may request more cycles."""
 ALWAYS_ALLOWED_CYCLES = 32
-"""Number of cycles always allowed, whatever MAX_CYCLES_RATIO: on a bright star they take little time."""
+"""Number of cycles allowed even beyond `MAX_CYCLES_RATIO`: on a bright star they take little time."""
 CHECK_FRACTION = 0.25
 """Number of check cycles relative to the cycles that R is computed from."""
 _MIN_CHECKS = 3
@@ -81,7 +81,7 @@ class Pokes:
     """
 
     def __init__(self, config: Configuration, calibration: Calibration, request: CalibrationRequest) -> None:
-        """Choose the amplitude; CalibrationError if too much is requested."""
+        """Choose the amplitude; CalibrationError if the requested one is too large."""
         self._request = request
         self.noise_nm = frame_noise_nm(config, calibration)
         self._modes = len(calibration.noll)
@@ -93,13 +93,13 @@ class Pokes:
         return self._cycle(number, self.amplitude_nm)
 
     def delay_plan(self, mode: int) -> poke_plan.Plan:
-        """The plan for measuring the delay: pokes of one mode; in closed loop with the total rms of a dither."""
+        """The plan for measuring the delay: pokes of one mode; in closed loop with the rms of all modes of a dither."""
         closed = self._request.method == "in-loop"
         amplitude = self.amplitude_nm * float(np.sqrt(self._modes)) if closed else AMPLITUDE_NM["poke"]
         return first_poke_plan(min(amplitude, float(self._largest_nm[mode])))
 
     def cycles(self) -> int:
-        """Number of cycles: the requested one, or the one that photon and read noise require."""
+        """Number of cycles: the requested number, or else the number that photon and read noise require."""
         request = self._request
         if request.cycles is not None:
             return request.cycles
@@ -109,7 +109,7 @@ class Pokes:
     def more_cycles(self, cycles: int, error: float) -> int:
         """Number of cycles required, given the standard error of R H after `cycles` cycles.
 
-        `cycles` itself if these suffice, or if too many would be required.
+        It is `cycles` if these suffice, if the number was requested, or if too many would be required.
         """
         if self._request.cycles is not None or error * self._request.snr <= 1:
             return cycles
@@ -117,7 +117,7 @@ class Pokes:
         return needed if needed <= max(MAX_CYCLES_RATIO * self.cycles(), ALWAYS_ALLOWED_CYCLES) else cycles
 
     def frames(self, cycles: int, done: int = 0) -> int:
-        """Frames of the cycles that remain after `done` cycles, and of all check cycles."""
+        """Number of frames in the cycles that remain after `done` cycles, and in all check cycles."""
         return (cycles + check_cycles(cycles) - done) * (len(self.cycle(0)) + TRAILING_FRAMES)
 
     def _cycle(self, number: int, amplitude_nm: float) -> poke_plan.Plan:
@@ -147,7 +147,7 @@ class Pokes:
         if requested > largest:
             raise CalibrationError(
                 f"--amplitude {requested:g} nm: from push to pull an actuator would move by more than "
-                f"{_SLEW_FRACTION:g} of the slew limit; at most {largest:.3g} nm"
+                f"{_SLEW_FRACTION:g} of the slew limit; give at most {largest:.3g} nm"
             )
         return requested
 
@@ -180,5 +180,5 @@ def cycles_for(snr: float, cycles: int, error: float) -> int:
 
 
 def check_cycles(cycles: int) -> int:
-    """Number of check cycles for a reconstructor made from a number of cycles."""
+    """Number of check cycles for a reconstructor that is computed from `cycles` cycles."""
     return max(_MIN_CHECKS, round(CHECK_FRACTION * cycles))

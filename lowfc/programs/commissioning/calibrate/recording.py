@@ -1,4 +1,4 @@
-"""Probe sequences on the mirror of a running loop: played, recorded as frames and steps, and fitted."""
+"""Probe sequences on the mirror of a running loop: play them, record frames and steps, fit the response."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -29,17 +29,17 @@ T = TypeVar("T")
 TRAILING_FRAMES = 8
 """Frames recorded after the end of a probe sequence, more than the longest delay that can be measured."""
 MAX_FRAMES_BEHIND = 100
-"""Frames by which the mirror's reports may lag behind the controller's steps; beyond it the sequence is repeated."""
+"""Frames by which mirror reports may lag behind controller steps; with a larger lag the sequence is repeated."""
 LEASE_CHECK_FRAMES = 100
 """Frames between two checks that the lease is still in force."""
 MAX_REFUSED_FRAMES = 50
 """Consecutive refused frames after which a probe sequence is abandoned."""
 ATTEMPTS = 5
-"""Attempts at a sequence if frames are lost or a device restarts."""
+"""Attempts at a probe sequence, if frames are lost or a device restarts."""
 FAULT_S = 5.0
-"""Longest wait before a probe sequence for the end of the mirror's fault."""
+"""Longest wait, before a probe sequence, for the end of a fault of the mirror."""
 DITHER_SLOWEST = 1 / 16
-"""Lowest frequency of a dither that is used, cycles per frame; most of the disturbance is below it."""
+"""Lowest frequency, cycles per frame, at which a dither is evaluated; most of the disturbance is at lower ones."""
 _LIMITS = frozenset(Limit) - {Limit.LAW_OVERRULED}  # limits that end a probe sequence
 
 
@@ -52,7 +52,7 @@ class PokesNotSeenError(CalibrationError):
 
 
 class Recording(NamedTuple):
-    """Frames of a probe sequence; number 0 is the first frame whose command had a row of the table.
+    """Frames and steps of a probe sequence; number 0 is the first frame whose command had a row of the table.
 
     Attributes:
         sequence: frame numbers (frames,), increasing; lost frames, and those without a step, are missing.
@@ -69,11 +69,11 @@ class Recording(NamedTuple):
     command_nm: Array
 
     def played(self, table: Array, delay_frames: float) -> Array:
-        """The table as seen by each exposure (frames, columns)."""
+        """The rows of the table that the exposures saw (frames, columns)."""
         return seen_rows(table, _weights(delay_frames), self.steps, self.commanded)[self._steps_of_frames]
 
     def commands(self, delay_frames: float) -> Array:
-        """The loop's own command as seen by each exposure (frames, modes)."""
+        """The loop's own command that each exposure saw (frames, modes)."""
         frames = np.arange(self.steps[-1] + 1)
         newest = np.maximum(np.searchsorted(self.steps, frames, "right") - 1, 0)  # for a missing step, the one before
         every_step = np.ones(len(self.steps), np.bool_)
@@ -94,20 +94,21 @@ class Recording(NamedTuple):
 
 
 def _weights(delay_frames: float) -> Array:
-    """Fraction (lags,) that an exposure sees of the row commanded `lag` frames before it."""
+    """Fraction (lags,) of an exposure that sees the row commanded 0, 1, ... frames before it."""
     return np.concatenate([[0.0], delay_weights(max(delay_frames, 1.0))])
 
 
 def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np.floating]) -> Recording:
-    """Play a table on the mirror and record until its last row has been seen.
+    """Play a table on the mirror and record until exposures have seen its last row.
 
     Args:
         loop: A connection to the controller.
         basis_nm: Shapes (shapes, actuators), nm of surface.
         table: Amplitude of each shape (frames, shapes).
 
-    CalibrationError if the sequence was ended; its subclass PlayInterruptedError if camera or mirror restarted or
-    stalled.
+    Raises:
+        CalibrationError: the sequence was ended; the subclass PlayInterruptedError if camera or mirror restarted or
+            stalled.
     """
     loop.check_lease()
     await_mirror(loop)
@@ -165,7 +166,7 @@ def check_size(shape: tuple[int, ...], in_use: Calibration) -> None:
 
 
 def warn_of_added_shapes(loop: Client, report: Report) -> None:
-    """Warn of an offset and channels that a new reference image contains: a loop with this image adds them again."""
+    """Warn of an offset and channels that a new reference image will contain: a loop with it adds them again."""
     state = loop.status().state or wire.ControllerState()
     added = [f"channel {channel.name}" for channel in state.channels if channel.shifts]
     added += ["the offset"] * any(state.offset_nm)
@@ -178,7 +179,7 @@ def warn_of_added_shapes(loop: Client, report: Report) -> None:
 
 @contextlib.contextmanager
 def _streams(loop: Client) -> Iterator[tuple[Iterator[Frame], Iterator[Step]]]:
-    """Frames and steps from now on; an error ends the probe sequence."""
+    """Context with the frames and steps from now on; an error ends the probe sequence."""
     with contextlib.closing(loop.frames()) as frames, contextlib.closing(loop.steps()) as steps:
         try:
             yield frames, steps
@@ -189,7 +190,7 @@ def _streams(loop: Client) -> Iterator[tuple[Iterator[Frame], Iterator[Step]]]:
 
 
 def _checked_mode(loop: Client, step: Step, previous: LoopMode | None, *, ended: bool) -> LoopMode:
-    """The mode of a step; raise if the probe sequence was stopped before it `ended`."""
+    """The mode of a step; raise if the probe sequence was stopped. `ended`: its last row is before this step."""
     if not ended and previous is not None and step.mode is not previous:
         loop.check_lease()  # its error names who ended the lease
         raise CalibrationError(
@@ -206,7 +207,7 @@ def _checked_mode(loop: Client, step: Step, previous: LoopMode | None, *, ended:
 
 
 def _commanded(step: Step) -> bool:
-    """Whether the mirror received the next row with this step; in open loop also if the frame was not measured."""
+    """Whether this step sent the next row to the mirror; in open loop it does even if the frame was not measured."""
     return step.error_nm is not None or (step.mode is not LoopMode.CLOSED and step.reasons[0] in UNMEASURED)
 
 
@@ -254,7 +255,7 @@ def _recording(images: list[Frame], steps: list[Step], first: int) -> Recording:
 
 @dataclass(frozen=True, slots=True)
 class Player:
-    """Sequences of pokes on the mirror of a loop, repeated if frames were lost or a device restarted.
+    """Plays sequences of pokes on the mirror of a loop; repeats them if frames were lost or a device restarted.
 
     Attributes:
         loop: connection to the controller.

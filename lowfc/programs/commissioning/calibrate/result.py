@@ -1,4 +1,4 @@
-"""The result of a calibration: contents of the file, properties and verdict."""
+"""The result of a calibration: the calibration for the file, its properties and the verdict."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,15 +24,15 @@ from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, cyc
 from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator
 
 MAX_NOISE_RATIO = 1.5
-"""Largest accepted ratio of the noise of the measured R to that of the computed R, at the same flux. A sensor far from
-its zero point exceeds it."""
+"""Largest accepted ratio of the noise of the measured R to that of the computed R, at the same flux. A wavefront far
+from the zero point exceeds it."""
 _MAX_MODEL_ERROR = 0.5  # largest error of an element of R H if the model is of this sensor and orientation
 DELAY_TOLERANCE_FRAMES = 0.1
 """Largest difference between measured and configured delay without a warning, frames."""
 
 
 class Verdict(Result):
-    """Verdict on a measured reconstructor; its cross-talk is measured on separate frames."""
+    """Verdict on a measured reconstructor; the cross-talk is measured with separate frames."""
 
     snr: float = result_field("signal-to-noise ratio requested", form=".3g")
     snr_reached: float = result_field("signal-to-noise ratio reached", form=".3g")
@@ -87,7 +87,7 @@ class CalibrationResult(Verdict, CalibrationProperties):
 
 
 class Comparison(Result):
-    """Differences of two calibrations; `estimators` and `bad_pixels` are lists by calibration, the others by mode."""
+    """Differences of two calibrations; `estimators` and `bad_pixels` are by calibration, the other lists by mode."""
 
     modes: int = result_field("modes")
     noll: list[int] = result_field("mode", form="Z{}", column=True)
@@ -102,7 +102,7 @@ class Comparison(Result):
 
 
 def finish_calibration(calibrator: Calibrator, data: CalibrationData) -> tuple[Calibration, CalibrationResult]:
-    """Compute R, check it on separate frames, and write the file; under another name if R is not recommended."""
+    """Compute R, check it with separate frames, and write the file, under another name if R is not recommended."""
     config, request, computed, measured = calibrator.config, calibrator.request, calibrator.computed, data.measured
     calibration, reconstruction = measured_calibration(config, calibrator.in_use, measured, request)
     check = calibrator.check(calibration, data)
@@ -119,7 +119,7 @@ def finish_calibration(calibrator: Calibrator, data: CalibrationData) -> tuple[C
         fields["cross_talk_error"] = float(measured.error.max())
         fields["computed_noise_nm"] = noise_nm.tolist()
     verdict = judge(request.snr, measured.cycles, measured.error, check, ratio, calibration.noll)
-    out = request.out  # a calibration that is not recommended does not replace it
+    out = request.out  # not replaced by a calibration that is not recommended
     file = out.with_name(f"{out.stem}.rejected{out.suffix}") if verdict.faults else out
     result = result_of(config, calibration, reconstruction, request.method, file, **fields, **verdict.json_object())
     calibration_file.save(calibration, file)
@@ -147,7 +147,7 @@ def compute_reconstructor(
 def measured_calibration(
     config: Configuration, in_use: Calibration, measured: Measured, request: CalibrationRequest
 ) -> tuple[Calibration, Reconstruction]:
-    """The calibration from cycles of pokes, with dark, mask and mirror commands of the previous one."""
+    """The calibration from cycles of pokes, with the dark, good pixels and mirror commands of `in_use`."""
     estimators = dict.fromkeys([*measured.initial.estimator.removesuffix(FIRST_SUFFIX).split("+"), request.method])
     calibration = replace(
         in_use,
@@ -166,7 +166,7 @@ def measured_calibration(
 
 
 def computed_noise_nm(config: Configuration, calibration: Calibration, computed: Calibration) -> Array | None:
-    """Noise (modes,) of the computed R at the flux of a calibration, nm; None if that R is of another sensor."""
+    """Noise (modes,) of the computed R at the flux of a calibration, nm; None if that R has other pixels or modes."""
     if not same_frames_and_modes(calibration, computed):
         return None
     return factory.frame_noise_nm(config, replace(calibration, reconstructor=computed.reconstructor * calibration.good))
@@ -180,9 +180,9 @@ def result_of(
     file: Path,
     **measured: Any,
 ) -> CalibrationResult:
-    """The result of a calibration; `measured`: the fields of a measured one, with its delay and its verdict."""
+    """The result of a calibration; `measured` has the fields of a measured one, such as its delay and verdict."""
     limit_nm = factory.settings(config).integrator(calibration.noll).limit_nm
-    # set, so that --json always has them
+    # set for a computed calibration, too, so that --json always has these fields
     fields = {"delay_frames": configured_delay(config), "delay_error_frames": None, "cycles": None, **measured}
     return CalibrationResult.model_construct(
         method=method,
@@ -215,7 +215,7 @@ def judge(
         required_snr: Required signal-to-noise ratio.
         cycles: Number of cycles that the reconstructor was computed from.
         error: Standard error of the elements of each row of R H (modes,).
-        check: Cross-talk on separate frames.
+        check: Cross-talk from separate frames.
         noise_ratio: Noise per frame relative to the computed reconstructor (modes,); None without a computed one.
         noll: Noll index of each mode.
     """
@@ -257,7 +257,7 @@ def judge(
 
 
 def comparison(first: Calibration, second: Calibration) -> Comparison:
-    """Differences on the common good pixels: I0 and H of the second calibration, as measured with R of the first."""
+    """Differences of two calibrations on their common good pixels: R of the first measures I0 and H of the second."""
     if not same_frames_and_modes(first, second):
         raise CalibrationError(
             "calibrations with different sensors or modes cannot be compared: the first has "
@@ -292,9 +292,9 @@ def _actuators_to_modes(config: Configuration, in_use: Calibration, matrix: Arra
 
     A common factor between measurement and model, from the mirror's stroke or sign for example, also applies to other
     shapes. A negative factor is accepted only if focus or spherical is among the modes: a mirror of the opposite sign
-    reverses all modes, but half a turn of most sensors reverses tip and tilt alone. If the sensor has another size or
-    orientation than the model, the result for other shapes is that of the calibration in use, if it has such a matrix;
-    otherwise other shapes are projected onto the modal shapes.
+    reverses all modes, but half a turn of most sensors reverses only odd modes, such as tip and tilt. If the sensor has
+    another size or orientation than the model, the result for other shapes is that of the calibration in use, if it has
+    such a matrix; otherwise other shapes are projected onto the modal shapes.
     """
     commands, previous = in_use.modes_to_actuators.astype(np.float64), in_use.actuators_to_modes.astype(np.float64)
     inverse, product = np.linalg.pinv(commands), matrix @ response  # R H is the identity unless R is regularised

@@ -40,7 +40,7 @@ from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pok
 from lowfc.programs.commissioning.calibrate.recording import Player, Report, check_size, warn_of_added_shapes
 
 _MIN_CORRELATION = 0.3
-"""A smaller correlation of the first poke's image with the calibration in use is reported as a warning."""
+"""A correlation of the first poke's image with the calibration in use that is below this causes a warning."""
 
 
 class CalibrationData(NamedTuple):
@@ -70,14 +70,14 @@ class Calibrator:
         progress: ProgressCallback,
         computed: Calibration,
     ) -> None:
-        """Get the controller's calibration, and read the completed cycles with --resume.
+        """Get the controller's calibration; with --resume, read the completed cycles.
 
         Args:
             loop: A connection to the controller.
             request: The requested calibration.
             report: Receives messages for the user.
-            progress: Receives the number of frames done and in total.
-            computed: Calibration of the optical model; its R may start the fit, if frame size and modes are the loop's.
+            progress: Receives the current step as text, and the number of frames done and in total.
+            computed: Calibration of the optical model; if its frame size and modes are the loop's, R may start the fit.
         """
         self._loop = loop
         self.request = request
@@ -138,12 +138,12 @@ class Calibrator:
         return state.mode if state is not None else wire.LOOP_MODE_OPEN
 
     def run(self, delay: Delay | None = None) -> CalibrationData:
-        """Measure the delay, which shows that pokes are detected, unless it is given; then measure the response."""
+        """Measure the delay, unless it is given, then the response. The delay also shows that pokes are detected."""
         delay = self.delay() if delay is None else delay
         return CalibrationData(self._cycles(delay), delay)
 
     def check(self, calibration: Calibration, data: CalibrationData) -> Check:
-        """Cross-talk of a new calibration at the present zero point, from separate cycles."""
+        """Measure the cross-talk of a new calibration, with cycles that it was not computed from."""
         R = calibration.reconstructor.astype(np.float64)
         cycles = data.measured.cycles
         count = check_cycles(cycles)
@@ -156,7 +156,7 @@ class Calibrator:
 
     @property
     def _quietest_mode(self) -> int:
-        """Index of the mode with the lowest noise; tip and tilt, the most disturbed, only if there is no other."""
+        """Index of the mode with the lowest noise; tip and tilt, the most disturbed, only if there is no other mode."""
         tilt = np.isin(self.in_use.noll, TIP_TILT)
         return int(np.where(tilt & ~tilt.all(), np.inf, self.pokes.noise_nm).argmin())
 
@@ -226,7 +226,7 @@ class Calibrator:
         return f"about {self.pokes.frames(needed, done) / self.config.camera.rate_hz:.0f} s to go"
 
     def _initial(self, delay: Delay) -> Initial:
-        """The initial R of the fit: the computed R, unless the R in use measures pokes with less noise."""
+        """The initial R of the fit: the computed R, unless the R in use measures the poke with less noise."""
         in_use = self.in_use
         usable = [each for each in (self.computed, in_use) if same_frames_and_modes(each, in_use)]
         candidates = [Initial(each.reconstructor.astype(np.float64) * in_use.good, each.estimator) for each in usable]
@@ -246,7 +246,7 @@ class Calibrator:
 
 
 def partial_path(out: Path) -> Path:
-    """File of the completed cycles until the calibration is complete."""
+    """File that keeps the completed cycles until the calibration is complete."""
     return out.with_name(out.name + ".part.npz")
 
 
@@ -259,7 +259,7 @@ def store(path: Path, sums: Sums, conditions: dict[str, Any]) -> None:
 
 
 def resumed(path: Path, conditions: dict[str, Any]) -> Sums:
-    """Read completed cycles; DataFileError if there are none, if the file is damaged, or if it has other conditions."""
+    """Read completed cycles; DataFileError without a file, or if it is damaged or was made under other conditions."""
     stored, sums = stored_cycles(path)
     for key, value in conditions.items():
         if stored.get(key) != value:
@@ -271,7 +271,7 @@ def resumed(path: Path, conditions: dict[str, Any]) -> Sums:
 
 
 def stored_cycles(path: Path) -> tuple[dict[str, Any], Sums]:
-    """Read the completed cycles, with method, amplitude and calibration; DataFileError without them or if damaged."""
+    """Read the conditions (method, amplitude, calibration) and cycles; DataFileError if the file is bad or absent."""
     if not path.is_file():
         raise DataFileError(f"nothing to resume: there is no {path}; omit --resume")
     try:

@@ -1,4 +1,4 @@
-"""The tasks of `lowfc calibrate` on a running loop or files; each returns its result."""
+"""The tasks of `lowfc calibrate`, on a running loop or on files; each returns a result."""
 
 import contextlib
 from collections.abc import Iterator
@@ -45,7 +45,7 @@ _LARGEST_NM = 1e5  # largest amplitude of a mode in --at
 
 
 class DarkResult(Result):
-    """A dark and its bad pixels."""
+    """A measured dark, and the number of bad pixels by kind."""
 
     frames: int = result_field("frames")
     dark_dn: float = result_field("dark, median", "DN", ".4g")
@@ -67,7 +67,7 @@ class ReferenceResult(Result):
 
 
 def calibrate_with_pokes(request: CalibrationRequest, run: str | None, *, load: bool) -> CalibrationResult:
-    """Calibrate a running loop with pokes; write the file at the end, and with `load` use it if it is recommended."""
+    """Calibrate a running loop with pokes and write the file; with `load`, load a recommended calibration."""
     require_folder(request.out, partial_path(request.out))
     console = Console(stderr=True)
     report = reporter(console)
@@ -99,7 +99,7 @@ def calibrate_with_pokes(request: CalibrationRequest, run: str | None, *, load: 
 def compute_calibration(
     file: Path | None, request: CalibrationRequest, at: str | None, run: str | None, *, load: bool
 ) -> CalibrationResult:
-    """Compute a calibration from a configuration, flat or at a wavefront; write the file, and with `load` use it."""
+    """Compute a calibration from a configuration, at a flat or the given wavefront; write it, with `load` load it."""
     require_folder(request.out)
     config = configuration(file)
     name, wavefront = ("", None) if at is None else zero_point(config, at)
@@ -124,7 +124,7 @@ def zero_point(config: Configuration, text: str) -> tuple[str, WavefrontFunction
     """The wavefront of --at: modes as in 4=15,7=-10 (Noll index = nm rms), or a file as for `lowfc ctl channel`.
 
     Returns:
-        The wavefront's name in a calibration, and the function that computes it.
+        The wavefront's name in a calibration, and the function that computes the wavefront.
     """
     if "=" not in text and Path(text).suffix:
         shape = shape_of(config, "--at", text)
@@ -155,7 +155,7 @@ def _modes(text: str) -> dict[int, float]:
 
 
 def take_dark(out: Path, run: str | None, frames: int, file: Path | None, *, load: bool) -> DarkResult:
-    """Write the calibration in use with a new dark and mask, from the loop's frames or a cube."""
+    """Write the calibration in use with a new dark and bad pixels, from the loop's frames or a file's."""
     require_folder(out)
     with Client(run) as loop, _in_use(loop) as (in_use, noise_and_gain):
         cube = next_frames(loop, frames) if file is None else images(file)
@@ -173,7 +173,7 @@ def take_dark(out: Path, run: str | None, frames: int, file: Path | None, *, loa
 
 
 def take_reference(out: Path, run: str | None, frames: int, *, load: bool) -> ReferenceResult:
-    """Write the calibration in use with the present image as its reference."""
+    """Write the calibration in use with the present image as the reference image."""
     require_folder(out)
     with Client(run) as loop, loop.reserved("lowfc calibrate reference"), _in_use(loop) as (in_use, noise_and_gain):
         warn_of_added_shapes(loop, reporter(Console(stderr=True)))
@@ -210,7 +210,7 @@ def _in_use(loop: Client) -> Iterator[tuple[Calibration, tuple[float, float]]]:
 
 
 def write(calibration: Calibration, out: Path, loop: Client | None) -> Calibration:
-    """Write a calibration with its identity; load it into the loop, if there is one."""
+    """Write a calibration with its identity, and load it unless `loop` is None; return it with the identity."""
     calibration = with_identity(calibration)
     calibration_file.save(calibration, out)
     if loop is not None:
@@ -225,7 +225,7 @@ def images(file: Path) -> Array:
 
 
 def reporter(console: Console) -> Report:
-    """Function that prints a line, warnings in yellow."""
+    """Make a function that prints a line; warnings are yellow."""
 
     def report(text: str) -> None:
         style = "yellow" if text.startswith("warning") else None

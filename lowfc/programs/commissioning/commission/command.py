@@ -16,7 +16,7 @@ def commission(
     out: Annotated[Path, typer.Option("--out", help="Output file (FITS).")] = Path("calibration.fits"),
     run: AnyRun = None,
     frames: Annotated[
-        int, typer.Option(min=16, max=100_000, help="Number of frames of the dark, and as many of the reference image.")
+        int, typer.Option(min=16, max=100_000, help="Number of frames for the dark, and for the reference image.")
     ] = 400,
     dark: Annotated[Path | None, typer.Option(help="Dark frames: a FITS or .npy cube (frames, rows, columns).")] = None,
     no_dark: Annotated[

@@ -1,4 +1,4 @@
-"""The steps from a running camera and mirror to a calibration in use and a closed loop."""
+"""The steps from a running camera and mirror to a calibration in use and, on request, a closed loop."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -47,18 +47,18 @@ from lowfc.programs.commissioning.commission.first_light import (
 
 METHOD = "hadamard"
 DEFAULT_SNR = 50.0
-"""Signal-to-noise ratio required of the noisiest mode, unless the number of cycles is given."""
+"""Signal-to-noise ratio required in the noisiest mode, unless the number of cycles is given."""
 CAMERA_FRAMES = 32
 """Frames from which size, rate and brightness are determined."""
 CHECK_GAIN = 0.1
 """Gain of the closed-loop check in place of automatic gains, which are 0 before they are measured.
 
-It is stable at any usual delay; with a wrong sign the error grows tenfold in 25 frames.
+The loop is stable with it at any usual delay; with a wrong sign the error grows about tenfold in 25 frames.
 """
 MAX_ERROR_RATIO = 1.5
-"""Largest ratio of measured to predicted error in the closed loop."""
+"""Largest accepted ratio of measured to predicted error in the closed loop."""
 MIN_RESIDUAL_FRAMES = 1000
-"""Smallest number of frames, after settling, for the prediction of the residual and for its measurement."""
+"""Smallest number of frames observed, after settling, to predict the residual and to measure it."""
 STEPS = (
     *("camera", "dark and bad pixels", "reference image", "delay", "orientation and sign", "poke amplitude"),
     *("response", "verdict", "prediction", "closed loop"),
@@ -101,8 +101,8 @@ class Commissioning:
         self._loop, self._config, self._computed, self._options = loop, config, computed, options
         self._report, self._progress, self._confirm = report, progress, confirm
         self._results: dict[str, Any] = {}
-        self._provisional_file: Path | None = None  # file of the provisional calibration, once that is in use
-        self._advice = ""  # text after an early end, once the calibration is loaded
+        self._provisional_file: Path | None = None  # set once the provisional calibration is about to be loaded
+        self._advice = ""  # text printed if an error occurs after the calibration was loaded
 
     def run(self) -> tuple[dict[str, Any], str]:
         """Carry out all steps; return the results, and the text to print without --json."""
@@ -201,7 +201,7 @@ class Commissioning:
         self._report(f"[{STEPS.index(name) + 1}/{len(STEPS)}] {name}")
 
     def _prepare_loop(self) -> Calibration | None:
-        """Check mode and mirror, and open a closed loop; return the calibration in use, if any."""
+        """Check mode and mirror, and open a closed loop; return the calibration in use, None without one."""
         state = self._state()
         if state.mode == wire.LOOP_MODE_SAFE:
             raise CalibrationError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
@@ -223,7 +223,7 @@ class Commissioning:
         return state
 
     def _measure_provisional(self) -> tuple[Calibration, Delay]:
-        """Measure the provisional calibration (dark, reference image, a first response) and the delay."""
+        """Measure dark, reference image, delay and first response; return the provisional calibration and the delay."""
         self._announce("camera")
         frames = list(self._loop.frames(CAMERA_FRAMES))
         camera = checked_camera(self._config, self._loop.camera_state(), frames, self._report)
@@ -290,7 +290,7 @@ class Commissioning:
 
     @contextlib.contextmanager
     def _fixed_gains(self, modes: list[int]) -> Iterator[None]:
-        """Context with the gain of the check in these modes; their gains are automatic again afterwards."""
+        """Context with the gain `CHECK_GAIN` in these modes; afterwards their gains are automatic again."""
         if not modes:
             yield
             return
@@ -339,7 +339,7 @@ class Commissioning:
         steps: list[Step] = []
         self._report(f"observing {frames} frames, {frames / self._config.camera.rate_hz:.0f} s")
         for step in self._loop.steps():
-            if step.frame_sequence < first:  # of the previous mode
+            if step.frame_sequence < first:  # a step in the previous mode
                 continue
             if step.mode is not mode:
                 self._loop.check_lease()  # its error names who ended the lease
@@ -353,7 +353,7 @@ class Commissioning:
 
 
 def _rms_nm(error_nm: Single, settling: int) -> float:
-    """Root mean square of the measured error of all modes, noise included, after the settling frames."""
+    """Rms of the measured error of all modes together, noise included, over the frames after settling."""
     used = np.isfinite(error_nm).all(axis=1) & (np.arange(len(error_nm)) >= settling)
     if used.sum() < MIN_RESIDUAL_FRAMES / 2:  # up to half may have been refused, such as late frames
         raise ValueError(f"{int(used.sum())} frames after {settling} of settling are too few for a residual")

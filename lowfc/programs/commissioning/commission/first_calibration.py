@@ -27,18 +27,18 @@ from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
 
 FIRST_NM = AMPLITUDE_NM["poke"]
 MAX_FIRST_NM = 32.0
-"""Largest amplitude of the first pokes, which is doubled until they are detected, nm rms of wavefront."""
+"""Largest amplitude of the first pokes, nm rms of wavefront. The amplitude is doubled until pokes are detected."""
 MAX_MISFIT = 0.35
-"""Largest rms difference of the image from the fitted computed image, relative to the image's rms, at which the sensor
-is the configured one."""
+"""Largest rms difference between the image and the fitted computed image at which the sensor counts as the configured
+one, relative to the standard deviation of the image."""
 CYCLES = 12  # cycles of pokes that measure the response without an optical model
 MAX_NONLINEARITY = 0.1
-"""Largest relative difference of the gains at full and half amplitude, beyond `_STANDARD_ERRORS` standard errors."""
-_STANDARD_ERRORS = 3.0
+"""Accepted relative difference of the gains at full and half amplitude, in addition to `_STANDARD_ERRORS` errors."""
+_STANDARD_ERRORS = 3.0  # number of standard errors
 
 
 def first_delay(player: Player, config: Configuration, mode: int = 0) -> Delay:
-    """Delay and image of a poke of a mode, with increasing amplitude until it is detected."""
+    """Delay and image of a poke of one mode; the amplitude is increased until the poke is detected."""
     in_use, report = player.in_use, player.report
     amplitude_nm, most_nm = FIRST_NM, float(largest_nm(config, in_use)[mode])
     while True:
@@ -61,9 +61,9 @@ def first_delay(player: Player, config: Configuration, mode: int = 0) -> Delay:
 def aligned_calibration(
     player: Player, config: Configuration, computed: Calibration, first_poke: Delay, results: dict[str, Any]
 ) -> Calibration | None:
-    """The computed calibration on the sensor's pixels, with the sign from the poke of the first mode.
+    """The computed calibration on the sensor's pixels, oriented by pokes of the first mode and, if needed, the second.
 
-    None if the sensor is not the configured one. The sensor's geometry is added to `results`.
+    None if the sensor is not the configured one; otherwise the sensor's geometry is added to `results`.
     """
     in_use, report = player.in_use, player.report
     image = (in_use.reference * in_use.flux_dn).reshape(in_use.shape).astype(np.float64)
@@ -75,7 +75,7 @@ def aligned_calibration(
         report(f"the image cannot be compared with the computed one: {error}")
         return None
     poke_correlation = abs(correlation(first_poke.response, calibration.response[:, 0]))
-    if alignment.residual <= MAX_MISFIT:  # otherwise a poke of tilt is of no use
+    if alignment.residual <= MAX_MISFIT:  # otherwise another poke is of no use
 
         def poke(mode: int) -> Array:
             return (first_delay(player, config, mode) if mode else first_poke).response
@@ -111,14 +111,14 @@ def poked_calibration(player: Player, config: Configuration, delay: Delay) -> Ca
         response += player.cycle(plan, delay.delay_frames).response / CYCLES
     calibration = replace(in_use, response=single(response), estimator=f"{config.control.estimator}+poke{FIRST_SUFFIX}")
     matrix = compute_reconstructor(config, calibration, None).matrix
-    player.report(f"{CYCLES} pokes of each mode by {amplitude_nm:.3g} nm")
+    player.report(f"each mode was poked in {CYCLES} cycles, by {amplitude_nm:.3g} nm")
     return with_identity(replace(calibration, reconstructor=single(matrix)))
 
 
 def linear_amplitude_nm(player: Player, config: Configuration, delay: Delay, default_nm: float) -> float:
     """Amplitude at which all modes may be poked at once, nm rms of each.
 
-    It is `default_nm`, halved if single pokes at full and half amplitude show that the sensor is not linear.
+    It is `default_nm`, or half of it if pokes of single modes at two amplitudes show that the sensor is not linear.
     """
     provisional = player.in_use
     R, modes = provisional.reconstructor.astype(np.float64), len(provisional.noll)
@@ -130,7 +130,7 @@ def linear_amplitude_nm(player: Player, config: Configuration, delay: Delay, def
             plan = _poke_cycle(modes, amplitude_nm, repetition)
             gains[level, repetition] = np.diag(R @ player.cycle(plan, delay.delay_frames).response)
     difference = np.abs(gains[0].mean(axis=0) / gains[1].mean(axis=0) - 1)
-    variance = gains.var(axis=1, ddof=1).mean(axis=0)  # of one gain, and of the difference of means of two gains each
+    variance = gains.var(axis=1, ddof=1).mean(axis=0)  # of one gain; that of a difference of means of two is equal
     error = np.sqrt(np.maximum(variance, variance.mean()))
     worst = int((difference - _STANDARD_ERRORS * error).argmax())
     chosen_nm = default_nm / 2 if difference[worst] > MAX_NONLINEARITY + _STANDARD_ERRORS * error[worst] else default_nm

@@ -21,8 +21,8 @@ from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.conformance.settings import agreement_checks
 
 MAX_RATE_DIFFERENCE = 0.05
-"""Largest relative difference between the rate from the frames' times and the rate in the camera's settings."""
-_MAX_BRIGHTNESS = 0.9  # of a good pixel, as a fraction of saturation
+"""Largest relative difference between the rate of the frames' times and the rate in the camera's settings."""
+_MAX_BRIGHTNESS = 0.9  # largest value of a good pixel in the reference frames, as a fraction of saturation
 _NS_PER_S = 1e9
 
 
@@ -31,7 +31,7 @@ class Sensor(NamedTuple):
 
     Attributes:
         camera: settings of the camera.
-        dark_dn: mean dark (pixels,), DN.
+        dark_dn: dark (pixels,), DN: mean of the dark frames, or the camera's bias.
         good: 1 for each pixel used, 0 otherwise (pixels,).
         measured: whether the dark was measured.
     """
@@ -45,7 +45,7 @@ class Sensor(NamedTuple):
 def checked_camera(
     config: Configuration, state: wire.CameraState, images: Sequence[Frame], report: Report
 ) -> CameraSettings:
-    """The camera's settings; CalibrationError if frames or configuration do not agree with them."""
+    """The camera's settings; CalibrationError if the frames or the configuration contradict them."""
     checks = list(agreement_checks(config, state))
     faults = [
         f"{check.name}: the camera has {check.got}, expected {check.expected}; {check.advice}"
