@@ -1,4 +1,4 @@
-"""A camera under test: its frames, settings and times."""
+"""The messages of a camera under test: frames and settings."""
 
 import zlib
 from collections.abc import Callable
@@ -20,7 +20,7 @@ STORED_IMAGES = 50
 
 
 class FrameRecord(NamedTuple):
-    """A frame without pixels; `publish_time_ns` is 0 without a valid envelope, `highest_dn` None with a wrong size."""
+    """A frame without pixels; `publish_time_ns` is 0 without a valid envelope, `highest_dn` None if sizes disagree."""
 
     receive_time_ns: int
     publish_time_ns: int
@@ -31,7 +31,7 @@ class FrameRecord(NamedTuple):
 
     @property
     def time_ns(self) -> int:
-        """End of the exposure."""
+        """End of the exposure, ns, as stated by the camera."""
         return from_timestamp(self.image.timestamp)
 
     @property
@@ -46,7 +46,7 @@ class Camera(CollectedMessages):
     Attributes:
         frames: every frame, without its pixels.
         unreadable: number of payloads that are not a RawImage.
-        pixels: pixels (rows, columns) of the first frames, decoded as little-endian.
+        pixels: pixels (rows, columns) of the first `STORED_IMAGES` frames, decoded as little-endian.
         states: the camera's settings in order of arrival; None for one that could not be decoded.
         answers: replies to a query for the settings.
     """
@@ -93,7 +93,7 @@ class Camera(CollectedMessages):
 
     @cached_property
     def shapes(self) -> list[tuple[int, int]]:
-        """Different sizes (rows, columns) of the frames; normally one."""
+        """The different sizes (rows, columns) of the frames; normally one."""
         return sorted({frame.shape for frame in self.frames})
 
     @cached_property

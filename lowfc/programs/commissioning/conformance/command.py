@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from lowfc.programs.commissioning.conformance.connection import Connection
 
 CONNECT_S = 3.0
-"""Time to wait for a device."""
+"""Longest wait for a device."""
 
 STATUSES = (Status.WRONG, Status.WARNING, Status.OK)
 FIELDS = {name: name for name in ("name", "status", "expected", "got", "advice")}
@@ -68,14 +68,14 @@ def mirror(
     run: RunName = None,
     config: ConfigFile = None,
     duration: Annotated[float, typer.Option(min=0.05, max=3600, help="Seconds of ordinary commands.")] = 5.0,
-    gentle: Annotated[bool, typer.Option("--gentle", help="Do not test the mirror's limits.")] = False,
+    gentle: Annotated[bool, typer.Option("--gentle", help="Neither raise the mirror nor test its limits.")] = False,
     as_json: Json = False,
 ) -> None:
     """Send commands to a mirror and check its states against the contract; exit status 1 if a check fails.
 
     The check takes the place of the controller, which must not be running. Ordinary commands are at most 5 % of the
     smallest limit, with alternating sign. Unless --gentle, the mirror is also raised by up to 10 nm, to see it relax;
-    if no check fails, commands then exceed its stroke, slew and neighbour limits. Its shape is restored at the end.
+    if no check fails, commands then exceed its stroke, slew and neighbour limits. The initial shape is restored.
 
     Example: lowfc conformance mirror --run bench --config lowfc.toml
     """

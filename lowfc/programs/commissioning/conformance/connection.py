@@ -28,7 +28,7 @@ class Received(NamedTuple):
 
     Attributes:
         key: key under which it was published.
-        payload: its bytes.
+        payload: bytes of the message.
         attachment: bytes of the envelope; None without an envelope.
         receive_time_ns: time of arrival on the host's clock.
     """
@@ -55,7 +55,7 @@ class Connection:
     """
 
     def __init__(self, links: Links, role: str) -> None:
-        """Join a run as `role`; BusError if that fails, as when another process has this role."""
+        """Join a run as `role`; BusError if that fails, for example because another process has this role."""
         self._clock = HostClock()
         self.offset_ns = self._clock.offset_ns
         self._start_s = links.claim_start(role, self._clock.start_s)
@@ -75,7 +75,7 @@ class Connection:
         return self._clock.now_ns()
 
     def wait(self, seconds: float) -> None:
-        """Sleep."""
+        """Sleep for a time."""
         time.sleep(seconds)
 
     def received(self) -> list[Received]:
@@ -91,7 +91,7 @@ class Connection:
         self._session.put(key, payload, attachment=envelope.encode(), priority=zenoh.Priority.REAL_TIME)
 
     def ask(self, key: str) -> list[Received]:
-        """Query the last message of a key; return the replies."""
+        """Query the last message under a key; return the replies."""
         return [self._received(reply.ok) for reply in self._session.get(key, timeout=1.0) if reply.ok is not None]
 
     def peers(self) -> int:

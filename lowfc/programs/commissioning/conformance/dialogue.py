@@ -1,4 +1,4 @@
-"""Commands to a mirror under test, small shapes first, and the states that answer the commands."""
+"""Commands to a mirror under test, and the states that answer the commands."""
 
 from collections.abc import Callable
 
@@ -17,11 +17,11 @@ from lowfc.programs.commissioning.conformance.connection import NS_PER_S, Collec
 ANSWER_S = 0.5
 """Timeout for an answer; a slower mirror cannot be used in a loop."""
 ATTEMPTS = 3
-"""Attempts before a check fails: a mirror skips commands that a stall of the host delayed."""
+"""Attempts before a check fails: a mirror skips commands that are late because the host stalled."""
 VALID_NS = NS_PER_S
 """Validity of an ordinary test command."""
 MODAL_NM = (0.5, -0.25)
-"""Modal command of every test command."""
+"""Modal command in every test command, nm rms of wavefront."""
 CHANNEL = "lowfc"
 """Channel of the controller, so that the first command of a later controller replaces the test's shape."""
 POLL_S = 0.002
@@ -29,7 +29,7 @@ POLL_S = 0.002
 Show = Callable[[str], None]
 
 _PATTERN_SEED = 5
-_ORDINARY = 0.05  # size of ordinary commands as a fraction of the smallest of stroke, slew and half neighbour limit
+_ORDINARY = 0.05  # size of ordinary commands relative to the smallest of stroke, slew and half the neighbour limit
 _MAX_MOVES = 400  # largest number of moves on the way to a distant shape
 
 
@@ -37,10 +37,10 @@ class Expected:
     """The mirror as configured; dead, stuck and inactive actuators are not checked.
 
     Attributes:
-        name: name in the mirror's topics.
+        name: name of the mirror, as in its topics.
         grid: rows and columns of actuators.
         limits: the mirror's limits, nm of surface.
-        step_nm: smallest step of its driver, nm of surface.
+        step_nm: smallest step of the driver, nm of surface.
         moving: whether each actuator is active, and neither dead nor stuck (rows, columns).
         period_ns: time between two commands of the loop.
     """
@@ -67,7 +67,7 @@ class Expected:
 
     @property
     def pattern_nm(self) -> Single:
-        """A shape without symmetry, far below every limit."""
+        """A shape (rows, columns) without symmetry, nm of surface, far below every limit."""
         largest = _ORDINARY * min(self.limits.stroke_nm, self.limits.slew_nm, self.limits.neighbour_nm / 2)
         drawn = np.random.default_rng(_PATTERN_SEED).uniform(-largest, largest, self.grid)
         return np.where(self.moving, drawn, 0).astype(np.float32)
@@ -79,7 +79,7 @@ class Dialogue(CollectedMessages):
     Attributes:
         states: every state that could be decoded, with its message.
         unreadable: number of states that could not be decoded.
-        failed: number of attempts that failed and were repeated, since it was last set to 0.
+        failed: number of attempts that failed and were repeated, since this number was last set to 0.
     """
 
     def __init__(self, connection: Connection, expected: Expected) -> None:
@@ -120,9 +120,9 @@ class Dialogue(CollectedMessages):
         return found if good else None
 
     def begin(self, shape_nm: Single, last_sequence: int) -> None:
-        """Start at the mirror's present shape, with the sequence after the last one that it followed.
+        """Start at the mirror's present shape, with the sequence after that of the last applied command.
 
-        A running camera's sequences are higher: the mirror will not refuse a controller that takes over afterwards.
+        A running camera's sequences are higher, so that the mirror will not refuse a later controller's commands.
         """
         self._commanded_nm, self._next = shape_nm, last_sequence + 1
 
@@ -152,7 +152,7 @@ class Dialogue(CollectedMessages):
             surface_nm: Shape (rows, columns), nm of surface.
             valid_ns: Time for which the command is valid.
             sequence: Frame sequence; the next one if None.
-            cut: Number of bytes removed from the end.
+            cut: Number of bytes removed from the end of the shape.
             clear_id: Identity of an operator's clear; 0 for none.
         """
         if sequence is None:
@@ -175,10 +175,11 @@ class Dialogue(CollectedMessages):
     def ask(
         self, surface_nm: Single, valid_ns: int = VALID_NS, sequence: int | None = None, clear_id: int = 0
     ) -> tuple[wire.MirrorState | None, int, int]:
-        """Send a command, again if it is not answered, and wait for the state that answers it.
+        """Send a command, and wait for the state that answers it; repeat the command if it is not answered.
 
         Returns:
-            The state, None without an answer; the command's time; the time until the answer, ns, 0 without an answer.
+            The state, None without an answer; the time of the answered or last command, ns; the time from this command
+            to the answer, ns, 0 without an answer.
         """
         self._commanded_nm, before, times_ns, sent_ns = surface_nm, len(self.states), dict[int, int](), 0
         for attempt in range(ATTEMPTS):
@@ -193,7 +194,7 @@ class Dialogue(CollectedMessages):
         return None, sent_ns, 0
 
     def go(self, surface_nm: Single) -> wire.MirrorState | None:
-        """Move to a shape in steps of at most half the slew limit; return the last answer, None if one was missing."""
+        """Move to a shape in moves of at most half the slew limit; return the last answer, None if one was missing."""
         start_nm, state = self.reported_nm, None
         count = max(1, int(np.ceil(float(np.abs(surface_nm - start_nm).max()) / self.expected.move_nm)))
         for index in range(1, count + 1):
@@ -207,7 +208,7 @@ class Dialogue(CollectedMessages):
         return height_nm / self.expected.move_nm < _MAX_MOVES
 
     def moved(self, before_nm: Single, state: wire.MirrorState) -> bool:
-        """Whether a state differs from a former surface by more than a driver step, or is not a finite grid."""
+        """Whether a state differs from a former surface by more than a driver step, or cannot be compared."""
         found = self.surface_nm(state)
         if found is None:
             return True

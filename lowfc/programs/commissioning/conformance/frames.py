@@ -15,13 +15,13 @@ from lowfc.programs.commissioning.conformance.publisher import PROCESS, PUBLISHE
 from lowfc.programs.commissioning.conformance.settings import SETTINGS
 
 _SILENT_PERIODS = 5  # longest wait between frames that is not reported, in frame periods
-_JITTER = 0.1  # largest deviation of 99 % of the waits that is not reported, in frame periods
+_JITTER = 0.1  # largest deviation of 99 % of the waits from the period that is not reported, in frame periods
 _SMOOTHER = 2.0  # roughness of an image relative to that with swapped bytes, above which its bytes count as swapped
 _READOUT_NS = 50_000_000  # longest plausible time from end of exposure to publication
 _FULL = 0.01  # fraction of the pixels above which saturated pixels are reported
-_STOPPED_NS = 300_000_000  # shorter silences, before the first frame and after the last together, do not count
+_STOPPED_NS = 300_000_000  # shorter time without frames, before the first and after the last together, is accepted
 _VARIED = 8  # the alignment of the bits is judged if the pixels have more different values than this
-_AGE_NS = 1_000_000  # tolerance of a frame's time
+_AGE_NS = 1_000_000  # tolerance of the age of a frame
 _OWN_WAIT_NS = 10_000_000  # shorter waits may be caused by this host, not by the camera
 
 ARRIVED: Table[Camera] = Table()
@@ -167,7 +167,7 @@ def _light(camera: Camera) -> Check | None:
 def _byte_order(camera: Camera) -> Check | None:
     if not camera.pixels:
         return None
-    picture = camera.pixels[-1]  # one image: a median of all is meaningless for swapped bytes
+    picture = camera.pixels[-1]  # one image: the median of several is meaningless with swapped bytes
     as_is, swapped = _roughness(picture), _roughness(picture.byteswap())
     if as_is > _SMOOTHER * swapped:
         got = f"the image is {as_is / max(swapped, 1e-9):.0f} times smoother with the bytes swapped: big-endian?"

@@ -14,16 +14,16 @@ from lowfc.programs.commissioning.conformance.connection import NS_PER_S
 from lowfc.programs.commissioning.conformance.dialogue import ANSWER_S, ATTEMPTS, MODAL_NM, Dialogue, Show
 from lowfc.programs.commissioning.conformance.publisher import PROCESS, PUBLISHER
 
-IDLE_S = 1.0
+IDLE_S = 1.0  # time for which the mirror is observed before the first command
 EXPIRES_NS = 300_000_000  # validity of the command that is left to expire
 SLACK_NS = 400_000_000  # time by which the mirror may report the timeout late
 
 _FOLLOWING, _EXPIRED = wire.MIRROR_STATUS_FOLLOWING, wire.MIRROR_STATUS_EXPIRED
-_LONG_NS = 60 * NS_PER_S
-_REFUSED_EVERY_NS = 50_000_000  # time between two commands that must be refused
+_LONG_NS = 60 * NS_PER_S  # validity that the driver must shorten
+_REFUSED_EVERY_NS = 50_000_000  # time between two invalid commands while a valid one expires
 _RAISED_NM = 10.0  # height by which the mirror is raised before the command timeout
 _REFUSAL_S = 0.15  # time in which a command would show in the states
-_NEAR, _BEYOND, _FAR = 0.9, 1.05, 2.0  # multiples of a limit
+_NEAR, _BEYOND, _FAR = 0.9, 1.05, 2.0  # commanded heights or moves relative to a limit
 _SETTLE_S = 0.05  # settling time of drivers that report measured actuator heights, not the targets
 
 
@@ -64,7 +64,7 @@ def mirror_checks(mirror: Dialogue, seconds: float, show: Show, *, gentle: bool 
 
 
 def _with_failed_attempts(mirror: Dialogue, checks: Iterator[Check]) -> Iterator[Check]:
-    """Add to the result of each check the number of failed attempts before it."""
+    """Add to the result of each check the number of failed attempts since the previous check."""
     for check in checks:
         failed, mirror.failed = mirror.failed, 0
         yield check._replace(got=f"{check.got} ({counted(failed, 'failed attempt')} before)") if failed else check
@@ -114,9 +114,9 @@ def _grid(mirror: Dialogue, state: wire.MirrorState) -> Check:
 
 
 def _ordinary_commands(mirror: Dialogue, base_nm: Single, seconds: float) -> Iterator[Check]:
-    """Send small shapes of alternating sign, one per period, and check the answers; end if the first has none.
+    """Send small shapes of alternating sign, one per period, and check the answers; end if the first has no answer.
 
-    If an answer was lost, the time of waiting for it is added to `seconds`.
+    If an answer was lost, `ANSWER_S` is added to the duration, `seconds`.
     """
     connection, period_ns = mirror.connection, mirror.expected.period_ns
     answers: list[wire.MirrorState] = []
@@ -199,7 +199,7 @@ def _applied(mirror: Dialogue, base_nm: Single, commanded_nm: Single, state: wir
 
 
 def _difference(base_nm: Single, commanded_nm: Single, reported_nm: Single, *, moved: bool) -> str:
-    """Advice: the error that transforms the commanded shape into the reported one.
+    """Advice that names the transformation of the commanded shape into the reported one.
 
     `moved`: whether an actuator moved by more than a step of the driver.
     """
@@ -368,7 +368,7 @@ def _within_limit(state: wire.MirrorState, reason: wire.Reason, reached_nm: floa
 
 
 def _reaches_stroke(mirror: Dialogue) -> bool:
-    """Move the mirror to 90 % of its stroke, in moves of half the slew limit; return whether it reached that."""
+    """Move the mirror to 90 % of its stroke, in moves of half the slew limit; return whether it reached 85 %."""
     stroke_nm = mirror.expected.limits.stroke_nm
     mirror.go(np.zeros(mirror.expected.grid, np.float32))
     if not mirror.reachable(stroke_nm):

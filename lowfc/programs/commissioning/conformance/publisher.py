@@ -13,9 +13,9 @@ from lowfc.programs.commissioning.checks import Check, Table, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.connection import NS_PER_S, CollectedMessages
 
 LATE_NS = 20_000_000
-"""Clock difference above which every frame of a camera with 100 Hz or more is refused as late by default."""
+"""Clock difference above which, by default, every frame of a camera of 100 Hz or more is refused as late."""
 
-_AHEAD_NS = 1_000_000  # time by which a message may appear to arrive before it was published
+_AHEAD_NS = 1_000_000  # largest time by which a message may seem to arrive before it was published
 _DECADE_S = 10 * 365 * 86_400
 _UNITS = {"microseconds": 1_000, "milliseconds": 1_000_000, "seconds": NS_PER_S}
 

@@ -141,11 +141,11 @@ class Agreement(NamedTuple):
 
     Attributes:
         field: field of lowfc.v1.CameraState.
-        key: configuration key that determines it.
-        unit: unit in which both are printed.
+        key: configuration key that determines the same value.
+        unit: unit in which both values are printed.
         tolerance: largest difference, relative to the configured value.
         needed: whether a difference disturbs the loop (status wrong), or only computed values (status warning).
-        use: results that depend on it.
+        use: results that depend on this setting.
     """
 
     field: str
@@ -169,7 +169,7 @@ AGREEMENTS = (
     Agreement("saturation_dn", "camera.full_well_e", "DN", 0.01, False, _SATURATED),
 )
 PERIODS_OF_TIMEOUT = 1.5
-"""Smallest `control.frame_timeout_ms` in frame periods; below it the timeout acts before every frame."""
+"""Smallest `control.frame_timeout_ms`, in frame periods; a shorter timeout may act although no frame is missing."""
 
 
 def agreement_checks(config: Configuration, state: wire.CameraState) -> Iterator[Check]:

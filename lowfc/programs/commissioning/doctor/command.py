@@ -27,10 +27,10 @@ def doctor(
     strict: Annotated[bool, typer.Option("--strict", help="Exit status 1 if there is a warning.")] = False,
     device: Annotated[
         str | None,
-        typer.Option(help="Check only the requirements of the driver of this name; exit status 1 if one is missing."),
+        typer.Option(help="Check only what the driver of this name requires; exit status 1 if something is missing."),
     ] = None,
     setup: Annotated[
-        bool, typer.Option("--setup", help="Show the settings that grant a user real-time rights.")
+        bool, typer.Option("--setup", help="Show the settings of the host that grant a user real-time rights.")
     ] = False,
     apply: Annotated[bool, typer.Option("--apply", help="As root: apply these settings.")] = False,
     undo: Annotated[bool, typer.Option("--undo", help="As root: remove these settings.")] = False,
@@ -92,7 +92,7 @@ def examine(facts: "Facts") -> list[Check]:
 
 
 def measured(facts: "Facts") -> dict[str, Any]:
-    """Values that `--json` prints besides the checks: wake-up percentiles by scheduling class, and the host."""
+    """Values that `--json` prints besides the checks: wake-up percentiles by scheduling class, and the host's data."""
     from lowfc.adapters.process.provenance import provenance
     from lowfc.programs.commissioning.doctor.timing import wake_up_us
 

@@ -40,9 +40,9 @@ def device_checks(name: str, config: Configuration) -> Iterator[Check]:
 
 
 def _kinds(name: str) -> list[plugins.Kind]:
-    """Kinds (camera, mirror) of the installed drivers of this name, or else of the class of this name.
+    """Kinds (camera, mirror) of the installed drivers of this name, or else of a driver class of this name.
 
-    The first kind if there is neither: loading it then gives the error.
+    If there is neither, it is the first kind: loading this driver then gives the error.
     """
     found = [kind for kind in plugins.KINDS if name in plugins.installed(kind)]
     return found or [kind for kind in plugins.KINDS if _loads(kind, name)] or list(plugins.KINDS[:1])

@@ -18,7 +18,7 @@ class Facts:
         host: the host, as reported by its kernel.
         config: configuration of the loop.
         trial: refused real-time settings and wake-up latencies, or the error if the trial failed.
-        busy: name and load, in processors, of the other processes during the measurement, from `Host.busy`.
+        busy: name, and load in processors, of other busy processes during the measurement, from `Host.busy`.
     """
 
     host: Host
@@ -41,7 +41,7 @@ class Facts:
 
 
 def gather(host: Host, config: Configuration, seconds: float) -> Facts:
-    """Request the loop's real-time settings, measure wake-ups in each class, and note other busy processes."""
+    """Try the loop's real-time settings, measure wake-up latencies in each scheduling class, list busy processes."""
     host.busy()  # the next call reports the load since this one
     trial: Trial | OSError
     try:

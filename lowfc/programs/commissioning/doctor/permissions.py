@@ -18,7 +18,7 @@ FILES = {"etc/security/limits.d/90-lowfc.conf": _LIMITS, "etc/udev/rules.d/90-lo
 
 
 def settings_text(root: Path) -> str:
-    """Text of the files, and of the commands that root has to run."""
+    """Text of the files to write, and of the commands that root has to run."""
     files = [f"# {root / name}\n{text}" for name, text in FILES.items()]
     user = os.environ.get("SUDO_USER") or os.environ.get("USER", "NAME")
     commands = f"groupadd --system --force {GROUP}\nusermod -aG {GROUP} {user}\n"
@@ -27,7 +27,7 @@ def settings_text(root: Path) -> str:
 
 
 def apply(root: Path, user: str) -> list[str]:
-    """Write the files, create the group with this user, and give the group access to the device; return the actions.
+    """Write the files, create the group with this user, and give the group access to the device; return what was done.
 
     Raises:
         ConfigurationError: not root, or a file exists with other contents.
@@ -58,7 +58,7 @@ def apply(root: Path, user: str) -> list[str]:
 
 
 def undo(root: Path) -> list[str]:
-    """Remove files, group and access to the device; return the actions.
+    """Remove the files, the group and its access to the device; return what was done.
 
     Raises:
         ConfigurationError: not root.

@@ -16,10 +16,10 @@ from lowfc.programs.commissioning.doctor.facts import Facts
 from lowfc.programs.core.recording.volume import bytes_per_s, configured_selection
 
 CHECKS: Table[Facts] = Table()
-"""The docstring of each check describes its subject; docs/howto/doctor.md also describes its warning."""
+"""The docstring of each check describes what it examines; docs/howto/doctor.md also describes its warning."""
 
 _STALL_S = 0.1  # stall of a reader that socket buffers should outlast
-_MIN_OPEN_FILES = 256  # limit of open files that a process needs
+_MIN_OPEN_FILES = 256  # smallest limit of open files that suffices for a process
 _MEMLOCK_ADVICE = "`lowfc doctor --setup` (memlock unlimited in limits.d), or the service's LimitMEMLOCK=infinity"
 
 
