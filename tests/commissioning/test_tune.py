@@ -197,7 +197,7 @@ def test_a_reconstructor_with_a_prior_for_uncorrected_modes_is_reported_and_a_fl
     night.change(CONTROLLER_STATE, -1, lambda state: state.prior_nm2.extend([0, 0, 4]))
     night.change(CONTROLLER_STATE, -1, lambda state: state.channels.add(name="flat"))
     warnings = json_of("tune", night.write(tmp_path / "night.mcap"))["warnings"]
-    assert ["modes that they do not correct (Z4)" in warning for warning in warnings] == [True]
+    assert ["modes that automatic gains do not correct (Z4)" in warning for warning in warnings] == [True]
 
 
 def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path) -> None:

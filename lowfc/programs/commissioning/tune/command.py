@@ -22,7 +22,7 @@ def tune(
     live: Annotated[float | None, typer.Option(min=1.0, max=1e5, help="Seconds to observe a running loop.")] = None,
     out: Annotated[Path | None, typer.Option(help="Write the law to this file (FITS).")] = None,
     apply: Annotated[bool, typer.Option("--apply", help="Apply the gains or the law to the running loop.")] = False,
-    plot: Annotated[Path | None, typer.Option(help="Draw spectra into this file (PNG).")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Plot the spectra to this file (PNG).")] = None,
     run: AnyRun = None,
     as_json: Json = False,
 ) -> None:
@@ -50,7 +50,7 @@ def tune(
     if apply:
         the_run(run)  # if there is no such loop, the error comes before the work, not after it
     if plot is not None:
-        figure_class()  # the same if matplotlib is missing
+        figure_class()  # likewise, if matplotlib is missing
     if logs:
         log = named_log(logs)
         with reading_bar(console) as count:

@@ -1,4 +1,4 @@
-"""Data for tuning: pseudo-open-loop modes of a log or of a running loop."""
+"""Data for tuning: pseudo-open-loop modes, errors and control law of a log or of a running loop."""
 
 import contextlib
 import time
@@ -36,7 +36,7 @@ from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.cli.status import holds_shape
 from lowfc.programs.logs.what_if.run import LoggedRun, SeenCommands, during_probe
 
-_SETTLING_S = 0.5  # least time excluded after the loop was closed, if enough frames are left
+_SETTLING_S = 0.5  # shortest time excluded after the loop was closed, if enough frames are left
 _POLL_FRAMES = 100  # frames between two requests for the state of a running loop
 
 
@@ -47,6 +47,7 @@ class Telemetry:
     Attributes:
         source: path of the log, or name of the run.
         noll: Noll index of each mode.
+        rate_hz: frame rate.
         timing: delay and exposure of the loop, measured if possible.
         law: the integrator's gains, leaks and limits at the end.
         driving: the linear law in force at the end; None if the integrator is in force.
@@ -57,11 +58,12 @@ class Telemetry:
             gains, or from all frames if fewer than `FEWEST` frames follow this change.
         true_nm2: mean products of the modes' true residuals at the starts of the exposures (modes, modes); None if
             unknown.
-        continuous_rms_nm: rms of the true residual over all time, also within exposures (modes,); None if unknown.
+        continuous_rms_nm: continuous-time rms of the true residual (modes,), not only at the starts of the exposures;
+            None if unknown.
         nm_per_mas: wavefront rms of a tilt of 1 mas; None if the telescope's diameter is unknown.
         contrast: contrast added by the modes; None without a science image.
         noise_nm2: computed covariance (modes, modes) of one frame's noise; None without a science image.
-        warnings: doubts about the results.
+        warnings: reasons to doubt the results.
     """
 
     source: str
@@ -83,9 +85,9 @@ class Telemetry:
 
 
 def telemetry_from_log(log: LogReader) -> Telemetry:
-    """The used closed-loop frames of a log; if these are too few, all used frames.
+    """The usable closed-loop frames of a log; if these are too few, all usable frames.
 
-    Frames with a probe sequence, as in an acceptance test, or of an earlier calibration are excluded.
+    Frames during a probe sequence, as in an acceptance test, and of an earlier calibration are excluded.
     """
     history = read_history(log)
     run = LoggedRun(history)
@@ -95,7 +97,7 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
     warnings = [
         *history.remarks,
         *_delay_warnings(run.controller_delay, run.seen, run.measured_delay, run.measured_from),
-        *_weighting_warnings(history.controller, run.calibration),
+        *_prior_warnings(history.controller, run.calibration),
     ]
     if log.damage:
         warnings.append("the log is damaged; unreadable parts are left out")
@@ -122,7 +124,7 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
 def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float], None] | None = None) -> Telemetry:
     """The steps of a running loop in the next `seconds`.
 
-    Frames with a probe sequence are excluded. The state is requested every `_POLL_FRAMES` frames: a shorter sequence
+    Frames during a probe sequence are excluded. The state is requested every `_POLL_FRAMES` frames: a shorter sequence
     may not be noticed. DataFileError without a calibration, if `seconds` are too few, or if no frame was used.
     """
     states = [_state(loop)]
@@ -156,7 +158,7 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
     steps = _from_first_used(loop.run_id, steps_as_columns(received, len(calibration.noll)))
     reports = np.array(() if watch is None else watch.applied, np.int64).reshape(-1, 2)
     applied, applied_ns = reports[:, 0].astype(np.uint64), reports[:, 1]
-    if watch is not None and watch.offset is not None:  # on the clock of the camera's host, as the times of frames are
+    if watch is not None and watch.offset is not None:  # put these on the clock of the camera's host, as frames
         camera = loop.processes().get(Role.CAMERA, wire.Health())
         applied_ns += watch.offset.offset_ns - camera.router_offset_ns
     period_s = float(np.median(np.diff(steps.time_ns))) * 1e-9 if len(steps.time_ns) > 1 else 0.0
@@ -164,7 +166,7 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
     assumed_delay = float(states[0].delay_frames)
     measured_delay = delay_from_times(steps.sequence, steps.time_ns - config.exposure_ns, applied, applied_ns)
     if config.lockstep or (measured_delay is not None and measured_delay < assumed_delay):
-        measured_delay = None  # time is simulated, or the mirror still moves after its report
+        measured_delay = None  # simulated time, or the mirror still moves after its report
     played = np.zeros(steps.sequence.shape, np.bool_)
     for state in states:
         if state.HasField("play"):
@@ -186,7 +188,7 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
         calibration_in_use(states[-1], calibration),
         [
             *_delay_warnings(assumed_delay, seen, measured_delay, "the times of frames and mirror"),
-            *_weighting_warnings(states[-1], calibration),
+            *_prior_warnings(states[-1], calibration),
             *lost,
         ],
     )
@@ -211,8 +213,8 @@ def _from_first_used(run_id: str, steps: Steps) -> Steps:
 def _without_probes(steps: Steps, seen: SeenCommands, assumed_delay: float, played: Mask) -> tuple[Steps, Mask]:
     """The steps with pseudo-open-loop modes for the measured delay, and whether each step is usable (steps,).
 
-    Steps with a probe sequence (`played`) get mode 0, as if the loop were not closed, so that the time to settle after
-    the sequence is excluded, too.
+    Steps during a probe sequence (`played`) get mode 0, as if the loop were not closed, so that the time to settle
+    after the sequence is excluded, too.
     """
     pol_nm = steps.pol_nm if seen.delay_frames == assumed_delay else steps.error_nm + seen.target_nm - seen.seen_nm
     usable = np.isfinite(pol_nm).all(axis=1) & ~seen.command_lost & ~played & (steps.saturated_pixels == 0)
@@ -228,14 +230,14 @@ def _delay_warnings(assumed_delay: float, seen: SeenCommands, measured_delay: fl
     ]
 
 
-def _weighting_warnings(state: wire.ControllerState | None, calibration: Calibration) -> list[str]:
+def _prior_warnings(state: wire.ControllerState | None, calibration: Calibration) -> list[str]:
     prior_nm2 = [] if state is None else state.prior_nm2
     names = ", ".join(f"Z{index}" for index, power in zip(calibration.noll, prior_nm2, strict=False) if power > 0)
     if not names:
         return []
     return [
-        f"automatic gains put the power of modes that they do not correct ({names}) into the reconstructor's weights: "
-        "if these get gains, the noise of the others is higher than predicted"
+        f"the reconstructor has a prior of the modes that automatic gains do not correct ({names}): if these modes get "
+        "gains, the noise of the other modes is higher than predicted"
     ]
 
 
@@ -267,13 +269,14 @@ def _telemetry(
     calibration: Calibration,
     warnings: Sequence[str],
 ) -> Telemetry:
-    """The usable steps after the closed loop has settled, or all usable steps if the former are too few.
+    """Telemetry of the usable steps after the closed loop has settled, or of all usable steps if these are too few.
 
-    `laws` are the integrator and the linear law in force, if any. `true_residual` has the residual at the start of each
-    exposure and its rms over all time (steps, modes). The laws are in force from the frame after `last_change` on.
+    `laws` are the integrator and the linear law in force, if any; they are in force from the frame after `last_change`
+    on. `true_residual` is the residual at the start of each exposure, and the continuous-time rms of each frame period
+    (steps, modes).
     """
     was_closed, index = steps.mode == LoopMode.CLOSED, np.arange(len(steps.mode))
-    frames_since = index - np.maximum.accumulate(np.where(was_closed, -1, index))  # since the loop was last not closed
+    frames_since = index - np.maximum.accumulate(np.where(was_closed, -1, index))  # since the loop was closed
     settling = settling_frames(laws[0].gain, laws[0].leak)
     if laws[1] is not None:
         settling = SETTLING_FRAMES + FADING_FRAMES + margins.settling_frames(laws[1], timing.delay)
