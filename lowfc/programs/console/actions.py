@@ -1,4 +1,4 @@
-"""The buttons of the console with their keys and actions. Requests are those of `lowfc.client.requests`."""
+"""The buttons of the console, with their keys and actions. The requests are those of `lowfc.client.requests`."""
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -89,7 +89,7 @@ _READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
     "law": ("law", _law),
     "calibration": ("calibration", _calibration),
 }
-"""By field of a request: name of the argument of `Client.ask`, and parser of the operator's text."""
+"""Argument of `Client.ask`, and parser of the operator's text, for each field of a request."""
 _LABELS = {
     "modes": "modes: Noll indices as in 2,3 or 4-8; empty for all",
     "actuators": "shape: file (FITS or .npy), nm of surface; empty removes the channel",
@@ -103,7 +103,7 @@ _LABELS = {
     "channel text": "name: up to 32 of a-z, 0-9 and -, starting with a letter",
     "note text": "note",
 }
-"""Label of a request's field in a form; the key is the field, or the request and the field."""
+"""Labels of the fields of requests in a form; the key is the field, or the request and the field."""
 
 
 def request_action(key: str, name: str, confirm: str = "") -> Action:

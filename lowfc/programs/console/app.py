@@ -1,4 +1,4 @@
-"""The console's screen: state of the run, updated five times a second, and buttons."""
+"""The console's screen: state of the run, read five times a second, and buttons."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -37,7 +37,7 @@ PICTURES_EVERY = 3
 RESTARTED = "restarted"
 """Result of the application if the run restarted and must be joined again."""
 _LEFT = 62  # columns of the left half
-_RESTART_CHECK_EVERY = 10  # number of readings from one check to the next
+_RESTART_CHECK_EVERY = 10  # number of readings from one check for a restart to the next
 
 
 class Console(OrderedKeys):
@@ -103,7 +103,7 @@ class Console(OrderedKeys):
             bus: bus of the run, joined as a monitor.
             run_id: name of the run.
             clock: clock of the run.
-            restarted: returns whether the run restarted, which changes its links.
+            restarted: returns whether the run restarted, so that the links have changed.
             terminal_gone: returns whether the terminal was closed.
         """
         super().__init__()
@@ -153,15 +153,15 @@ class Console(OrderedKeys):
             self._do(action, {})
 
     def action_choose(self, by: int) -> None:
-        """Choose a knob."""
+        """Choose the next (1) or the previous (-1) knob."""
         self.query_one(Gains).choose(by)
 
     def action_turn(self, steps: int) -> None:
-        """Turn the chosen knob."""
+        """Turn the chosen knob by a number of steps."""
         self.query_one(Gains).turn(steps)
 
     def action_automatic(self) -> None:
-        """Set the gains of the chosen knob to automatic."""
+        """Make the gains of the chosen knob automatic."""
         self.query_one(Gains).automatic()
 
     def action_mute(self) -> None:
@@ -186,7 +186,7 @@ class Console(OrderedKeys):
     def _do(self, action: Action, values: Values, form: Form | None = None) -> None:
         """Start a task, or send a request, in a new thread.
 
-        A request waits for the answer to the previous request of the same button; SAFE does not wait.
+        It waits until the previous thread of the same button has ended; SAFE does not wait.
         """
         self._show_answer(f"{action.name}: requested", ok=True)
         previous = self._requesting.get(action.name) if action is not SAFE else None
@@ -213,7 +213,7 @@ class Console(OrderedKeys):
         self._requesting[action.name].start()
 
     def _answered(self, action: Action, form: Form | None, text: str, *, ok: bool) -> None:
-        """Show the answer to an action, or why it failed; also in the form of the action, if it has one."""
+        """Show the answer to an action, or why it failed. A form shows a failure, too, and closes otherwise."""
         if self._torn_down:
             return
         self._show_answer(text, ok=ok)
