@@ -346,7 +346,7 @@ def test_another_operators_request_ends_a_calibration_and_stays_in_force(
 
 @pytest.mark.parametrize("frames_before_end", [None, 3])
 def test_a_dead_mirror_ends_the_calibration(monkeypatch: pytest.MonkeyPatch, frames_before_end: int | None) -> None:
-    monkeypatch.setattr(mirror_watch, "SILENT_S", 0.0)
+    monkeypatch.setattr(mirror_watch, "DEFAULT_TIMEOUT_S", 0.0)
     loop, reports = FaultyLoop({3: (kill_mirror, ignore)}, frames_before_end), list[str]()
     calibrator = calibrator_of(loop, "hadamard", report=reports.append)
     with pytest.raises(BusError, match=r"no mirror state came .* is the mirror's process running"):
