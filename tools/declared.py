@@ -136,9 +136,9 @@ def agreement() -> str:
     head = ("camera setting", "configuration key", "tolerance", "needed", "used for")
     rows = []
     for setting in AGREEMENTS:
-        needed = "yes" if setting.needed else "no"
+        needed = "yes" if setting.disturbs_loop else "no"
         tolerance = f"{setting.tolerance:.0%}" if setting.tolerance else "exactly equal"
-        rows.append((f"`{setting.field}`", f"`{setting.key}`", tolerance, needed, setting.use))
+        rows.append((f"`{setting.field}`", f"`{setting.key}`", tolerance, needed, setting.used_for))
     return markdown(head, rows)
 
 

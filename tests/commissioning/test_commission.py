@@ -362,7 +362,7 @@ def test_a_difference_of_camera_and_configuration_is_found(agreement: Agreement)
     state = configured_camera(Configuration())
     setattr(state, agreement.field, 2 * getattr(state, agreement.field))
     status = faults(Configuration(), state)[agreement.field]
-    assert status is (Status.WRONG if agreement.needed else Status.WARNING)
+    assert status is (Status.WRONG if agreement.disturbs_loop else Status.WARNING)
 
 
 def test_an_existing_calibration_is_replaced_only_with_force(own_runtime: Path) -> None:

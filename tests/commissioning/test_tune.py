@@ -83,7 +83,9 @@ def test_each_law_is_tuned_from_a_closed_loop(telemetry: Telemetry, tuned_as: Tu
 
 def test_predictions_contain_the_part_of_a_constant_disturbance_that_a_leak_leaves(telemetry: Telemetry) -> None:
     pol = replace(telemetry.pol, values=tuple(piece + np.array([0, 0, 50]) for piece in telemetry.pol.values))
-    run = replace(telemetry, pol=pol, law=replace(telemetry.law, leak=np.full(len(NOLL), 0.01, np.float32)))
+    run = replace(
+        telemetry, pol=pol, integrator=replace(telemetry.integrator, leak=np.full(len(NOLL), 0.01, np.float32))
+    )
     best, gains = tuned(run, "integrator")
     focus = result_of(run, best, gains, "integrator").modes[2]
     assert focus.predicted_nm == pytest.approx(gains.predicted_nm[2], rel=0.05)
@@ -335,7 +337,7 @@ def test_probe_sequences_on_a_running_loop_are_excluded(gain: float, settling: i
     run = telemetry_from_run(SteppedLoop(closed_loop(disturbance_nm, 1), later_gain=gain), 60.0)
     assert run.pol.frames == pytest.approx(6000 - settling - PROBE.frames - settling, abs=10)
     assert np.abs(run.pol.joined()).max() < 20
-    assert run.law.gain == pytest.approx(gain), "the law is the last one"
+    assert run.integrator.gain == pytest.approx(gain), "the gains are the last ones"
 
 
 def test_a_closed_loop_with_few_frames_after_half_a_second_is_not_called_open() -> None:

@@ -132,7 +132,7 @@ def contrast(
 
 
 def wedge_samples(wedge: Wedge, columns: int, rows: int, samples_per: int = SAMPLES_PER) -> Mask:
-    """Samples (rows, columns) of an image that lie in the wedge."""
+    """Mask (rows, columns) of the samples of an image that lie in the wedge."""
     x, y = image_axis(columns, samples_per), image_axis(rows, samples_per)[:, None]
     r = np.hypot(x, y)
     opening = np.abs(y) <= np.tan(np.deg2rad(wedge.half_opening_deg)) * np.abs(x)

@@ -94,9 +94,9 @@ class Live:
     def check_length(self, frames: int, columns: int, basis: Single | None) -> None:
         """Raise AcceptanceError if a table of this size, with the shapes `basis`, is too large for a request."""
         shape_bytes = 0 if basis is None else basis.nbytes
-        most_frames = (max_bytes("play") - _OTHER_BYTES - shape_bytes) // (4 * max(columns, 1))
-        if columns and frames > most_frames:
-            longest_s = most_frames / self.loop.rate_hz
+        max_frames = (max_bytes("play") - _OTHER_BYTES - shape_bytes) // (4 * max(columns, 1))
+        if columns and frames > max_frames:
+            longest_s = max_frames / self.loop.rate_hz
             raise AcceptanceError(f"a probe sequence of {columns} columns is too long: shorten it to {longest_s:.0f} s")
 
     def play(

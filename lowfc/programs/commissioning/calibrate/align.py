@@ -19,7 +19,7 @@ from lowfc.control.calibration.calibration import Calibration, normalise_flux
 from lowfc.control.calibration.response_fit import correlation
 from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.analytic import analytic
-from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, first_poke_plan, largest_nm
+from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, first_poke_plan, largest_amplitude_nm
 from lowfc.programs.commissioning.calibrate.recording import Player, check_size, next_frames
 from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
 from lowfc.programs.commissioning.calibrate.tasks import reporter, write
@@ -65,7 +65,7 @@ def align_sensor(out: Path, run: str | None, frames: int, *, load: bool) -> Alig
         player = Player(loop, on_sensor(config, computed, alignment.geometry, in_use), reporter(console))
 
         def poke(mode: int) -> Array:
-            amplitude_nm = min(AMPLITUDE_NM["poke"], float(largest_nm(config, player.in_use)[mode]))
+            amplitude_nm = min(AMPLITUDE_NM["poke"], float(largest_amplitude_nm(config, player.in_use)[mode]))
             return player.first_poke(mode, first_poke_plan(amplitude_nm)).response
 
         alignment, calibration, mean_correlation = oriented(config, computed, alignment, in_use, poke)

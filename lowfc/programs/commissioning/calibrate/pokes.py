@@ -85,7 +85,7 @@ class Pokes:
         self._request = request
         self.noise_nm = frame_noise_nm(config, calibration)
         self._modes = len(calibration.noll)
-        self._largest_nm = largest_nm(config, calibration)
+        self._largest_amplitude_nm = largest_amplitude_nm(config, calibration)
         self.amplitude_nm = self._amplitude(config, calibration)
 
     def cycle(self, number: int) -> poke_plan.Plan:
@@ -96,7 +96,7 @@ class Pokes:
         """The plan for measuring the delay: pokes of one mode; in closed loop with the rms of all modes of a dither."""
         closed = self._request.method == "in-loop"
         amplitude = self.amplitude_nm * float(np.sqrt(self._modes)) if closed else AMPLITUDE_NM["poke"]
-        return first_poke_plan(min(amplitude, float(self._largest_nm[mode])))
+        return first_poke_plan(min(amplitude, float(self._largest_amplitude_nm[mode])))
 
     def cycles(self) -> int:
         """Number of cycles: the requested number, or else the number that photon and read noise require."""
@@ -106,7 +106,7 @@ class Pokes:
         frames = poke_plan.frames_for_snr(request.snr / MARGIN, float(self.noise_nm.max()), self.amplitude_nm)
         return max(ceil(frames / self.cycle(0).per_column), MIN_CYCLES)
 
-    def more_cycles(self, cycles: int, error: float) -> int:
+    def required_cycles(self, cycles: int, error: float) -> int:
         """Number of cycles required, given the standard error of R H after `cycles` cycles.
 
         It is `cycles` if these suffice, if the number was requested, or if too many would be required.
@@ -143,7 +143,7 @@ class Pokes:
         steepest = float(np.abs(np.diff(shapes, axis=0)).max())
         largest = _largest_move_nm(config) / max(steepest, 1e-9)
         if requested is None:
-            return min(default_nm(method, self._request.snr), largest)
+            return min(default_amplitude_nm(method, self._request.snr), largest)
         if requested > largest:
             raise CalibrationError(
                 f"--amplitude {requested:g} nm: from push to pull an actuator would move by more than "
@@ -157,7 +157,7 @@ def first_poke_plan(amplitude_nm: float) -> poke_plan.Plan:
     return poke_plan.dither(1, amplitude_nm, DELAY_FRAMES, 1, SEED)
 
 
-def largest_nm(config: Configuration, calibration: Calibration) -> Array:
+def largest_amplitude_nm(config: Configuration, calibration: Calibration) -> Array:
     """Largest amplitude (modes,) at which push to pull stays within the slew limit, nm rms of wavefront."""
     steepest = np.abs(calibration.modes_to_actuators).max(axis=0)
     return np.asarray(_largest_move_nm(config) / (2 * np.maximum(steepest, 1e-9)), dtype=np.float64)
@@ -168,7 +168,7 @@ def _largest_move_nm(config: Configuration) -> float:
     return _SLEW_FRACTION * min(config.safety.slew_nm, config.mirror.slew_nm)
 
 
-def default_nm(method: str, snr: float) -> float:
+def default_amplitude_nm(method: str, snr: float) -> float:
     """Default amplitude of a mode, nm rms: halved above `FULL_AMPLITUDE_SNR`, and again above 4, 16, ... times it."""
     halvings = max(0, ceil(log(snr / FULL_AMPLITUDE_SNR, 4)))
     return float(AMPLITUDE_NM[method] / 2**halvings)

@@ -199,7 +199,7 @@ class Calibrator:
         needed = max(pokes.cycles(), sums.cycles)
         self._report(
             f"{needed} cycles of {len(pokes.cycle(0))} frames and {check_cycles(needed)} check cycles; "
-            + self._to_go(needed, sums.cycles)
+            + self._remaining_time(needed, sums.cycles)
         )
         while True:
             while sums.cycles < needed:
@@ -209,12 +209,12 @@ class Calibrator:
                 store(path, sums, self._conditions)
                 self.completed = sums.cycles
             measured = fit_response(sums)
-            required = pokes.more_cycles(needed, float(measured.error.max()))
+            required = pokes.required_cycles(needed, float(measured.error.max()))
             if required <= needed:
                 return measured
             self._report(
                 f"the cycles scatter more than photon and read noise: {required} cycles instead of {needed}; "
-                + self._to_go(required, needed)
+                + self._remaining_time(required, needed)
             )
             needed = required
 
@@ -222,7 +222,7 @@ class Calibrator:
         total = self.pokes.frames(needed)
         self._progress(doing, total - self.pokes.frames(needed, done), total)
 
-    def _to_go(self, needed: int, done: int) -> str:
+    def _remaining_time(self, needed: int, done: int) -> str:
         return f"about {self.pokes.frames(needed, done) / self.config.camera.rate_hz:.0f} s to go"
 
     def _initial(self, delay: Delay) -> Initial:

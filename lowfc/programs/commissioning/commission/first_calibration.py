@@ -21,7 +21,13 @@ from lowfc.programs.commissioning.calibrate.align import (
     on_sensor,
     oriented,
 )
-from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, HOLD, SETTLE, first_poke_plan, largest_nm
+from lowfc.programs.commissioning.calibrate.pokes import (
+    AMPLITUDE_NM,
+    HOLD,
+    SETTLE,
+    first_poke_plan,
+    largest_amplitude_nm,
+)
 from lowfc.programs.commissioning.calibrate.recording import TRAILING_FRAMES, Player, PokesNotSeenError
 from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
 
@@ -40,14 +46,14 @@ _STANDARD_ERRORS = 3.0  # number of standard errors
 def first_delay(player: Player, config: Configuration, mode: int = 0) -> Delay:
     """Delay and image of a poke of one mode; the amplitude is increased until the poke is detected."""
     in_use, report = player.in_use, player.report
-    amplitude_nm, most_nm = FIRST_NM, float(largest_nm(config, in_use)[mode])
+    amplitude_nm, max_nm = FIRST_NM, float(largest_amplitude_nm(config, in_use)[mode])
     while True:
-        amplitude_nm = min(amplitude_nm, most_nm)
+        amplitude_nm = min(amplitude_nm, max_nm)
         try:
             delay = player.first_poke(mode, first_poke_plan(amplitude_nm))
             break
         except PokesNotSeenError:
-            if amplitude_nm >= min(MAX_FIRST_NM, most_nm):
+            if amplitude_nm >= min(MAX_FIRST_NM, max_nm):
                 raise
             report(f"pokes of {amplitude_nm:g} nm are not detected: amplitude doubled")
             amplitude_nm *= 2
@@ -103,7 +109,7 @@ def aligned_calibration(
 def poked_calibration(player: Player, config: Configuration, delay: Delay) -> Calibration:
     """A calibration from pokes of each mode, without an optical model."""
     in_use, modes = player.in_use, len(player.in_use.noll)
-    amplitude_nm = min(FIRST_NM, float(largest_nm(config, in_use).min()))
+    amplitude_nm = min(FIRST_NM, float(largest_amplitude_nm(config, in_use).min()))
     response = np.zeros_like(in_use.response, dtype=np.float64)
     _report_time(player, config, CYCLES)
     for number in range(CYCLES):
@@ -122,10 +128,10 @@ def linear_amplitude_nm(player: Player, config: Configuration, delay: Delay, def
     """
     provisional = player.in_use
     R, modes = provisional.reconstructor.astype(np.float64), len(provisional.noll)
-    top_nm = min(FIRST_NM, float(largest_nm(config, provisional).min()))
+    full_nm = min(FIRST_NM, float(largest_amplitude_nm(config, provisional).min()))
     gains = np.empty((2, 2, modes))
     _report_time(player, config, gains[..., 0].size)
-    for level, amplitude_nm in enumerate((top_nm, top_nm / 2)):
+    for level, amplitude_nm in enumerate((full_nm, full_nm / 2)):
         for repetition in range(2):
             plan = _poke_cycle(modes, amplitude_nm, repetition)
             gains[level, repetition] = np.diag(R @ player.cycle(plan, delay.delay_frames).response)
@@ -135,7 +141,7 @@ def linear_amplitude_nm(player: Player, config: Configuration, delay: Delay, def
     worst = int((difference - _STANDARD_ERRORS * error).argmax())
     chosen_nm = default_nm / 2 if difference[worst] > MAX_NONLINEARITY + _STANDARD_ERRORS * error[worst] else default_nm
     player.report(
-        f"the gains at {top_nm:.3g} nm and at half of that differ by {difference[worst]:.1%} (+- {error[worst]:.1%}; "
+        f"the gains at {full_nm:.3g} nm and at half of that differ by {difference[worst]:.1%} (+- {error[worst]:.1%}; "
         f"Z{provisional.noll[worst]}); amplitude of each mode: {chosen_nm:.3g} nm"
     )
     return chosen_nm

@@ -106,7 +106,7 @@ class Dialogue(CollectedMessages):
 
     @property
     def reported_nm(self) -> Single:
-        """Reported surface (rows, columns), or the last commanded one if the report cannot be decoded."""
+        """Reported surface (rows, columns), nm; the last commanded one if no usable surface was reported."""
         found = self.surface_nm(self.last)
         return self._commanded_nm if found is None else found
 
@@ -115,8 +115,8 @@ class Dialogue(CollectedMessages):
 
         None also if the grid has another size than configured, or a value is not finite or beyond the full stroke.
         """
-        found, most_nm = None if state is None else actuators(state), 2 * self.expected.limits.stroke_nm
-        good = found is not None and found.shape == self.expected.grid and bool((np.abs(found) <= most_nm).all())
+        found, max_nm = None if state is None else actuators(state), 2 * self.expected.limits.stroke_nm
+        good = found is not None and found.shape == self.expected.grid and bool((np.abs(found) <= max_nm).all())
         return found if good else None
 
     def begin(self, shape_nm: Single, last_sequence: int) -> None:

@@ -49,10 +49,12 @@ def mirror_checks(mirror: Dialogue, seconds: float, show: Show, *, gentle: bool 
             raised_by_nm = 0.0 if gentle else min(_RAISED_NM, mirror.expected.move_nm)
             found += _with_failed_attempts(mirror, _timeout(mirror, base_nm, raised_by_nm))
         if gentle or _any_wrong(found):
-            untried = warning("not tested: another check failed", "correct that first")
+            not_tested = warning("not tested: another check failed", "correct that first")
             if gentle:
-                untried = warning("not tested: --gentle", "test the limits without --gentle before the loop is closed")
-            found.append(untried._replace(name="limits", expected="stroke, slew and neighbour limits of the driver"))
+                not_tested = warning(
+                    "not tested: --gentle", "test the limits, without --gentle, before closing the loop"
+                )
+            found.append(not_tested._replace(name="limits", expected="stroke, slew and neighbour limits of the driver"))
         else:
             show("limits")
             found += _with_failed_attempts(mirror, _limit_checks(mirror))
@@ -185,15 +187,16 @@ def _applied(mirror: Dialogue, base_nm: Single, commanded_nm: Single, state: wir
     if reported_nm is None:
         got = f"{state.rows} x {state.columns}, {len(state.actuators)} bytes"
         return wrong(got, "report the actuators' heights, rows x columns finite float32")
-    off_nm = np.where(expected.moving, np.abs(reported_nm - commanded_nm), 0)
-    away = np.flatnonzero(off_nm > expected.tolerance_nm)
-    if not away.size:
-        return ok(f"within {float(off_nm.max()):.2g} nm")
-    got = f"{away.size} of {off_nm.size} actuators off, by {float(off_nm.max()):.3g} nm at most"
-    if away.size <= off_nm.size // 10:
-        return warning(got, f"are they dead? Exclude them in the map mirror.active: {', '.join(map(str, away[:8]))}")
+    difference_nm = np.where(expected.moving, np.abs(reported_nm - commanded_nm), 0)
+    differing = np.flatnonzero(difference_nm > expected.tolerance_nm)
+    if not differing.size:
+        return ok(f"within {float(difference_nm.max()):.2g} nm")
+    got = f"{differing.size} of {difference_nm.size} actuators off, by {float(difference_nm.max()):.3g} nm at most"
+    if differing.size <= difference_nm.size // 10:
+        names = ", ".join(map(str, differing[:8]))
+        return warning(got, f"are they dead? Exclude them in the map mirror.active: {names}")
     moved = (np.abs(reported_nm - base_nm) > expected.tolerance_nm) & expected.moving
-    if moved.any() and not moved.flat[away].any():
+    if moved.any() and not moved.flat[differing].any():
         return wrong(got, "they do not move, the others do: exclude those without a channel in the map mirror.active")
     return wrong(got, _difference(base_nm, commanded_nm, reported_nm, moved=bool(moved.any())))
 
@@ -203,36 +206,36 @@ def _difference(base_nm: Single, commanded_nm: Single, reported_nm: Single, *, m
 
     `moved`: whether an actuator moved by more than a step of the driver.
     """
-    commanded, got = commanded_nm.astype(np.float64) - base_nm, reported_nm.astype(np.float64) - base_nm
+    commanded, reported = commanded_nm.astype(np.float64) - base_nm, reported_nm.astype(np.float64) - base_nm
     turns = {
-        "with the right orientation": got,
-        "with rows and columns exchanged": got.T,
-        "with rows reversed": got[::-1],
-        "with columns reversed": got[:, ::-1],
-        "rotated by 180 degrees": got[::-1, ::-1],
+        "with the right orientation": reported,
+        "with rows and columns exchanged": reported.T,
+        "with rows reversed": reported[::-1],
+        "with columns reversed": reported[:, ::-1],
+        "rotated by 180 degrees": reported[::-1, ::-1],
     }
     similarity = {
-        how: float((commanded * turned).sum() / max(np.linalg.norm(commanded) * np.linalg.norm(turned), 1e-30))
-        for how, turned in turns.items()
+        orientation: float((commanded * turned).sum() / max(np.linalg.norm(commanded) * np.linalg.norm(turned), 1e-30))
+        for orientation, turned in turns.items()
         if turned.shape == commanded.shape
     }
-    how = max(similarity, key=lambda name: abs(similarity[name]))
-    if abs(similarity[how]) < 0.9:
+    best = max(similarity, key=lambda name: abs(similarity[name]))
+    if abs(similarity[best]) < 0.9:
         if not moved:
             return (
                 f"none moves: does the driver send the values? If its step is above {np.abs(commanded).max():.3g} nm, "
                 "set mirror.driver_bits"
             )
         return "the reported and the commanded shape are unrelated: check the driver's order of the actuators"
-    scale = float((commanded * turns[how]).sum() / (commanded**2).sum())
-    advice = f"the reported shape is the commanded one {how}, times {scale:.3g}"
+    scale = float((commanded * turns[best]).sum() / (commanded**2).sum())
+    advice = f"the reported shape is the commanded one {best}, times {scale:.3g}"
     if abs(scale - 2) < 0.02:
         advice += ": report surface, not wavefront"
     elif abs(scale - 1e-3) < 1e-4:
         advice += ": report nm, not um"
     elif scale < 0:
         advice += ": the sign is wrong; a positive command raises the surface"
-    elif how == "with the right orientation" and abs(scale - 1) < 0.05:
+    elif best == "with the right orientation" and abs(scale - 1) < 0.05:
         advice += ": does the driver round? Set mirror.driver_bits so that stroke_nm / 2^driver_bits is its step"
     return advice
 
@@ -241,7 +244,7 @@ def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
     """Send invalid commands, which the mirror must refuse, and valid commands in between, which it must apply."""
     rows, columns = mirror.expected.grid
     other_nm = base_nm + np.float32(0.5) * mirror.expected.pattern_nm[::-1]
-    nan_nm, infinite_nm, lost = other_nm.copy(), other_nm.copy(), 0
+    nan_nm, infinite_nm, lost_commands = other_nm.copy(), other_nm.copy(), 0
     nan_nm[rows // 2, columns // 2], infinite_nm[rows // 2, columns // 2] = np.nan, np.inf
     for name, defect, target_nm, cut in (
         ("NaN refused", "one actuator NaN", nan_nm, 0),
@@ -252,7 +255,7 @@ def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
     ):
         expected = f"a command with {defect} changes nothing, and the next valid one is applied"
         state, _, _ = mirror.ask(base_nm)
-        lost += mirror.failed > 0
+        lost_commands += mirror.failed > 0
         before_nm = mirror.surface_nm(state)
         if state is None or before_nm is None:
             got = "a valid command before it is not answered"
@@ -266,7 +269,7 @@ def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
         advice = "before any move, check shape, byte count, isfinite, and frame_sequence not below the last"
         yield judged(name, expected, not bad, "nothing changed", advice, got)
     state, _, _ = mirror.ask(base_nm)
-    if state is None or (mirror.failed and lost >= 4):  # lost after each invalid command: no stall of this host
+    if state is None or (mirror.failed and lost_commands >= 4):  # not a stall of this host
         expected, advice = "valid commands are applied after invalid ones", "catch decoding errors, and continue"
         got = "no more answers" if state is None else "the first valid command after each invalid one is lost"
         yield judged("after bad commands", expected, False, got, advice)
@@ -357,9 +360,9 @@ def _limit_checks(mirror: Dialogue) -> Iterator[Check]:
         mirror.go(flat_nm)
 
 
-def _within_limit(state: wire.MirrorState, reason: wire.Reason, reached_nm: float, most_nm: float) -> Check:
+def _within_limit(state: wire.MirrorState, reason: wire.Reason, reached_nm: float, max_nm: float) -> Check:
     got = f"{reached_nm:.4f} nm"
-    if reached_nm > most_nm:
+    if reached_nm > max_nm:
         return wrong(got, "clip every command in the driver: do not rely on the controller's limits")
     if reason in state.limits_hit:
         return ok(got)

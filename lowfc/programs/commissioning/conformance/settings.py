@@ -144,16 +144,16 @@ class Agreement(NamedTuple):
         key: configuration key that determines the same value.
         unit: unit in which both values are printed.
         tolerance: largest difference, relative to the configured value.
-        needed: whether a difference disturbs the loop (status wrong), or only computed values (status warning).
-        use: results that depend on this setting.
+        disturbs_loop: whether a difference disturbs the loop (status wrong) or only computed values (status warning).
+        used_for: results that depend on this setting.
     """
 
     field: str
     key: str
     unit: str
     tolerance: float
-    needed: bool
-    use: str
+    disturbs_loop: bool
+    used_for: str
 
 
 _WEIGHTS = "the weights of the pixels in R, the predicted noise"
@@ -183,8 +183,8 @@ def agreement_checks(config: Configuration, state: wire.CameraState) -> Iterator
         divisor = _NS_PER_MS if unit == "ms" else 1.0
         got, expected = (f"{value / divisor:.6g} {unit}".rstrip() for value in (reported, configured))
         agree = abs(reported - configured) <= agreement.tolerance * abs(configured)
-        expected, severity = f"{expected}, as configured", wrong if agreement.needed else warning
-        advice = f"set {agreement.key}, or the camera; it is used for: {agreement.use}"
+        expected, severity = f"{expected}, as configured", wrong if agreement.disturbs_loop else warning
+        advice = f"set {agreement.key}, or the camera; it is used for: {agreement.used_for}"
         yield judged(f"{field} and {agreement.key}", expected, agree, got, advice, severity=severity)
     frame_timeout_ms, period_ms = config.frame_timeout_ns * 1e-6, state.period_ns * 1e-6
     enough, got = frame_timeout_ms >= PERIODS_OF_TIMEOUT * period_ms, f"{frame_timeout_ms:g} ms"

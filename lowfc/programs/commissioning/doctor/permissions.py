@@ -58,7 +58,7 @@ def apply(root: Path, user: str) -> list[str]:
 
 
 def undo(root: Path) -> list[str]:
-    """Remove the files, the group and its access to the device; return what was done.
+    """Remove the files if unchanged, the group, and its access to the device; return what was done.
 
     Raises:
         ConfigurationError: not root.

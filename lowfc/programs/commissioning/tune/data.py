@@ -49,8 +49,8 @@ class Telemetry:
         noll: Noll index of each mode.
         rate_hz: frame rate.
         timing: delay and exposure of the loop, measured if possible.
-        law: the integrator's gains, leaks and limits at the end.
-        driving: the linear law in force at the end; None if the integrator is in force.
+        integrator: the integrator's gains, leaks and limits at the end.
+        law: the linear law in force at the end; None if the integrator is in force.
         closed: whether the loop was closed in these frames.
         frames_closed: number of these frames with the loop closed.
         pol: pseudo-open-loop modes (frames, modes), in pieces without gaps.
@@ -70,8 +70,8 @@ class Telemetry:
     noll: tuple[int, ...]
     rate_hz: float
     timing: Timing
-    law: Integrator
-    driving: LinearLaw | None
+    integrator: Integrator
+    law: LinearLaw | None
     closed: bool
     frames_closed: int
     pol: TimeSeries
@@ -314,8 +314,8 @@ def _telemetry(
         noll=calibration.noll,
         rate_hz=rate_hz,
         timing=timing,
-        law=laws[0],
-        driving=laws[1],
+        integrator=laws[0],
+        law=laws[1],
         closed=closed,
         frames_closed=int((rows & was_closed).sum()),
         pol=pol,

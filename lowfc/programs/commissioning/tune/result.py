@@ -37,7 +37,7 @@ OPTICAL_GAIN_MAS = 10.0
 
 def tuned(data: Telemetry, controller: str) -> tuple[Tuned, Gains]:
     """The best law of a kind for a run; ValueError if there are too few frames, or no law of this kind is stable."""
-    leak = data.law.leak.astype(np.float64)
+    leak = data.integrator.leak.astype(np.float64)
     gains = best_gains(data.pol, data.rate_hz, data.timing, leak)
     models = identify_modes(data.pol, data.rate_hz)
     match controller:
@@ -120,7 +120,7 @@ class TuneResult(Result):
 def result_of(data: Telemetry, best: Tuned, gains: Gains, controller: str) -> TuneResult:
     """Predicted residual of a tuned law, with the residual of the run."""
     now, stable = _present_law(data)
-    leak = data.law.leak.astype(np.float64)
+    leak = data.integrator.leak.astype(np.float64)
     integrators = tune_integrator(best.models, gains, data.noll, leak, data.timing)
     now_nm = predicted_nm(now, best.models, data.timing) if stable else None
     achieved_nm = _achieved_nm(data, gains.noise_nm)
@@ -141,7 +141,7 @@ def result_of(data: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tu
         "predicted_now_nm": None if now_nm is None else with_mean(now, now_nm),
         "predicted_nm": best_nm,
         "integrator_predicted_nm": integrator_nm,
-        "gain_now": None if data.driving else data.law.gain.astype(float).round(6),
+        "gain_now": None if data.law else data.integrator.gain.astype(float).round(6),
         "gain_best": gains.gain.round(4),
         "phase_margin_deg": best.margins.phase_margin_deg,
         "max_rejection": best.margins.peak,
@@ -221,7 +221,7 @@ def picture(data: Telemetry, best: Tuned) -> bytes:
 
 def _present_law(data: Telemetry) -> tuple[LinearLaw, bool]:
     """The law in force, and whether it is stable with the run's delay."""
-    law = data.driving or integrator(data.law.gain, data.law.leak, data.noll, data.timing.delay, data.rate_hz)
+    law = data.law or integrator(data.integrator.gain, data.integrator.leak, data.noll, data.timing.delay, data.rate_hz)
     return law, margins.margins(law, data.timing.delay).stable
 
 
