@@ -1,4 +1,4 @@
-"""The process of a driver: it joins a run; parts of its command line."""
+"""Run a camera or mirror driver as a process of a run; parts of the drivers' command line."""
 
 import threading
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ from lowfc.device.watch import closed_on_fault, opening
 
 
 def driver_command(kind: Kind, name: str | None = None) -> type[TyperCommand]:
-    """Make a command class whose help lists the options of a driver: `name`, or else that of the argument `driver`."""
+    """Make a command class whose help lists the options of the driver `name`; default: the argument `driver`."""
 
     class WithOptions(TyperCommand):
         driver = name
@@ -33,7 +33,7 @@ def driver_command(kind: Kind, name: str | None = None) -> type[TyperCommand]:
 
         def format_options(self, ctx: Any, formatter: Any) -> None:
             super().format_options(ctx, formatter)
-            own = {option for parameter in self.params for option in parameter.opts}  # the driver receives the others
+            own = {option for parameter in self.params for option in parameter.opts}  # the driver receives all others
             rows = options_help(load(kind, self.driver)) if self.driver else []
             rows = [row for row in rows if row[0].split()[0] not in own]
             if rows:

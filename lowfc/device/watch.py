@@ -1,4 +1,4 @@
-"""Watch of a driver: calls that raise or do not return are counted and reported in events; pauses before retries."""
+"""Watch of a driver: faults and hanging calls are counted and reported in events; a fault delays the next call."""
 
 import re
 import threading

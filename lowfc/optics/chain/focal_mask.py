@@ -47,6 +47,6 @@ def bowtie(samples_per: int = 8, radius: float = 4.0, outer_radius: float = 10.0
 
 
 def _polar(samples_per: int, radius: float) -> tuple[Array, Array]:
-    """Radius, in lambda0 / D, and angle from the y axis, 0 to pi / 2, of the samples (k, k) around a disk."""
+    """Radius, in lambda0 / D, and angle from the y axis, 0 to pi / 2, of samples (k, k) for a mask of this radius."""
     x = image_axis(2 * int(np.ceil(radius * samples_per)), samples_per)
     return np.hypot(x[:, None], x), np.arctan2(np.abs(x), np.abs(x)[:, None])

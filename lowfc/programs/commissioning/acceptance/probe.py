@@ -125,7 +125,7 @@ class ProbeResponse:
         pol_nm: pseudo-open-loop modes (frames, modes); NaN as in `error_nm`.
         command_nm: modal command (frames, modes) after each frame; NaN where the frame is missing.
         mode: loop mode (frames,), 0 where a frame is missing.
-        reasons: for each frame (frames,), bit `1 << reason` of each reason why it was refused or a limit acted.
+        reasons: bits `1 << reason` (frames,): why the frame was refused, or the limits that acted.
     """
 
     parameters: dict[str, Any]

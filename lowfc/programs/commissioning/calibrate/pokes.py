@@ -20,7 +20,7 @@ AMPLITUDE_NM = {"poke": 8.0, "hadamard": 3.0, "in-loop": 2.0}
 MIN_SNR = 20.0
 """Signal-to-noise ratio required by default if the number of cycles is given."""
 FULL_AMPLITUDE_SNR = 70.0
-"""Signal-to-noise ratio above which the default amplitude is reduced: errors of linearity grow as its square."""
+"""Signal-to-noise ratio above which the default amplitude is reduced: nonlinearity grows as the amplitude squared."""
 MAX_HADAMARD_NM = 3.0
 """Largest amplitude of a mode, nm rms: all modes at once add up to some four times that, within the linear range."""
 SETTLE = 2

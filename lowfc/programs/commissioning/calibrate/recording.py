@@ -190,7 +190,7 @@ def _streams(loop: Client) -> Iterator[tuple[Iterator[Frame], Iterator[Step]]]:
 
 
 def _checked_mode(loop: Client, step: Step, previous: LoopMode | None, *, ended: bool) -> LoopMode:
-    """The mode of a step; raise if the probe sequence was stopped. `ended`: its last row is before this step."""
+    """The mode of a step; raise if the probe sequence was stopped. `ended`: all rows precede this step."""
     if not ended and previous is not None and step.mode is not previous:
         loop.check_lease()  # its error names who ended the lease
         raise CalibrationError(

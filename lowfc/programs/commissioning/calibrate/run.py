@@ -40,7 +40,7 @@ from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pok
 from lowfc.programs.commissioning.calibrate.recording import Player, Report, check_size, warn_of_added_shapes
 
 _MIN_CORRELATION = 0.3
-"""A correlation of the first poke's image with the calibration in use that is below this causes a warning."""
+"""Absolute correlation of the first poke's image with that of the calibration in use below which there is a warning."""
 
 
 class CalibrationData(NamedTuple):

@@ -99,7 +99,7 @@ def calibrate_with_pokes(request: CalibrationRequest, run: str | None, *, load: 
 def compute_calibration(
     file: Path | None, request: CalibrationRequest, at: str | None, run: str | None, *, load: bool
 ) -> CalibrationResult:
-    """Compute a calibration from a configuration, at a flat or the given wavefront; write it, with `load` load it."""
+    """Compute a calibration from a configuration, at a flat or the given wavefront; write it, and load it if `load`."""
     require_folder(request.out)
     config = configuration(file)
     name, wavefront = ("", None) if at is None else zero_point(config, at)

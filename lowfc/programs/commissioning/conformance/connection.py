@@ -75,7 +75,7 @@ class Connection:
         return self._clock.now_ns()
 
     def wait(self, seconds: float) -> None:
-        """Sleep for a time."""
+        """Sleep for `seconds`."""
         time.sleep(seconds)
 
     def received(self) -> list[Received]:

@@ -158,7 +158,7 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
     steps = _from_first_used(loop.run_id, steps_as_columns(received, len(calibration.noll)))
     reports = np.array(() if watch is None else watch.applied, np.int64).reshape(-1, 2)
     applied, applied_ns = reports[:, 0].astype(np.uint64), reports[:, 1]
-    if watch is not None and watch.offset is not None:  # put these on the clock of the camera's host, as frames
+    if watch is not None and watch.offset is not None:  # onto the clock of the camera's host, as the frames' times
         camera = loop.processes().get(Role.CAMERA, wire.Health())
         applied_ns += watch.offset.offset_ns - camera.router_offset_ns
     period_s = float(np.median(np.diff(steps.time_ns))) * 1e-9 if len(steps.time_ns) > 1 else 0.0
