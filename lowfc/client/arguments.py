@@ -27,7 +27,7 @@ def real(values: npt.ArrayLike) -> npt.ArrayLike:
 
 
 def required(name: str, value: object, kind: type[T]) -> T:
-    """Return `value`, an argument of a request; RequestRefusedError if it is not a `kind` (a path instead of a law)."""
+    """Return `value`, an argument of a request; RequestRefusedError if its type is not `kind`."""
     if not isinstance(value, kind):
         raise RequestRefusedError(f"{name} refused: it takes a {kind.__name__}, got {brief(value)}")
     return value

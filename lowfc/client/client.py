@@ -60,8 +60,8 @@ from lowfc.control.loop.wording import AUTO
 Modes = int | np.integer[Any] | Sequence[int] | npt.NDArray[np.integer[Any]]
 M = TypeVar("M", bound=Message)
 
-CONNECT_S = 1.0
-ANSWER_S = 2.0
+CONNECT_S = 1.0  # longest wait of a new client for its first peer, and time for which it repeats a query
+ANSWER_S = 2.0  # answer timeout
 SLOW_ANSWER_S = 30.0
 """Answer timeout for a large request, such as a calibration, and for the start and the end of a log."""
 LARGE_BYTES = 100_000
@@ -83,8 +83,8 @@ class Client:
 
     Only the process that answers a request has to be running.
 
-    Every request is carried out between two frames or refused; the answer has the first frame for which the request is
-    in force. A refused request raises RequestRefusedError, an unanswered one BusError.
+    Every request is carried out between two frames or refused; the answer has the sequence of the first frame for which
+    it is in force. A refused request raises RequestRefusedError, an unanswered one BusError.
     """
 
     def __init__(self, run: str | None = None, *, bus: Bus | None = None) -> None:
@@ -122,7 +122,7 @@ class Client:
         """Leave the run; the loop continues unchanged."""
         if self._own_bus is not None:
             self._own_bus.close()
-            self._bench.clear()  # a new publisher on the closed bus raises BusError, an old one would raise zenoh's
+            self._bench.clear()  # new publishers on the closed bus raise BusError, old ones would raise zenoh's error
 
     status = _request_method("status")
     open_loop = _request_method("open")
@@ -150,7 +150,7 @@ class Client:
         return self.ask("limit", modes, values)
 
     def step(self, frames: int) -> Answer:
-        """Close the loop for a number of frames; it then opens automatically."""
+        """Close the loop until this number of frames has been used; it then opens automatically."""
         return self.ask("step", values=frames)
 
     def offset(self, values: npt.ArrayLike = (), modes: Modes = ()) -> Answer:
@@ -205,6 +205,7 @@ class Client:
         """Reserve the loop: until the end of the block, other clients' requests that would change it are refused.
 
         `safe` from anyone, and `open`, `pause` or `stop` from another client, end the reservation: see `check_lease`.
+        `duration_s` is the expected duration, shown to other clients; the reservation does not end after it.
         """
         lockstep = bool(tomllib.loads(self.configuration()).get("lockstep"))
         self._lease = lease = Lease(self.ask, purpose, duration_s, lockstep=lockstep)
@@ -316,7 +317,7 @@ class Client:
         return Stream(self._bus.ring(FRAME, BUFFERED_MESSAGES), frame_of, "frame", count, patience_s)
 
     def steps(self, count: int | None = None, patience_s: float = DEFAULT_TIMEOUT_S) -> Stream[Step]:
-        """Stream steps of the control law from now on, `count` of them or without end; see `frames`."""
+        """Stream control steps, one for each frame, from now on, `count` of them or without end; see `frames`."""
         return Stream(self._bus.ring(STEP, BUFFERED_MESSAGES), step_of, "step", count, patience_s)
 
     def mirror_watch(self) -> MirrorWatch:
@@ -359,8 +360,9 @@ class Client:
             message.calibration.MergeFromString(encode_calibration(required(name, calibration, Calibration), 0))
         payload = message.SerializeToString()
         if len(payload) > max_bytes(name):
+            remedy = ": send it in parts" if name in ("play", "note") else ""
             raise RequestRefusedError(
-                f"{name} refused: at most {max_bytes(name):,} bytes, got {len(payload):,}: send it in parts"
+                f"{name} refused: at most {max_bytes(name):,} bytes, got {len(payload):,}{remedy}"
             )
         timeout_s = SLOW_ANSWER_S if len(payload) > LARGE_BYTES else ANSWER_S
         return self._answer(name, self._get(REQUEST_KEY.format(name=name), payload, timeout_s))

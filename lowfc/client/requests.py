@@ -16,7 +16,7 @@ class Declaration(NamedTuple):
         key: key of the query.
         fields: fields of the message, with their content.
         description: what the request does.
-        example: an example of its command, as after `lowfc ctl`; empty if the request has no command.
+        example: arguments of `lowfc ctl` that send the request; empty if it has no command.
     """
 
     key: str
@@ -49,7 +49,10 @@ DECLARED: tuple[Declaration, ...] = (
         "pause",
     ),
     _declared(
-        "step", "Close the loop for a number of frames, then open it again.", "step 100", ("values", "used frames")
+        "step",
+        "Close the loop until a number of frames has been used, then open it again.",
+        "step 100",
+        ("values", "number of frames"),
     ),
     _declared("safe", "Relax the mirror to flat and latch it there until `clear`.", "safe"),
     _declared("clear", "Leave safe mode; the loop is open afterwards, or idle without a calibration.", "clear"),
@@ -88,8 +91,8 @@ DECLARED: tuple[Declaration, ...] = (
     ),
     _declared(
         "play",
-        "Play a probe sequence, unknown to the control law: one row of a table per frame, from the frame in the answer "
-        "to the end of the table.",
+        "Play a probe sequence: one row of a table per frame, from the frame in the answer to the end of the table. "
+        "Shapes played on the mirror are unknown to the control law; those on the offset change the loop's target.",
         "",
         ("text", "`mirror` or `offset`"),
         ("table", "float32, frames x columns: factors of the shapes, or nm rms of wavefront of each mode"),

@@ -19,7 +19,8 @@ def the_run(name: str | None) -> str:
     """Find a run by its name or a unique prefix, or the only run if `name` is None; the run may have no controller.
 
     Raises:
-        BusError: no run has that name; the run or its router is stopped; or, for None, there is no run or several.
+        BusError: no live run has that name, its router does not answer, or several names begin with it; or, for None,
+            no run or more than one is live.
         DataFileError: the run's directory is damaged.
     """
     runs = live_runs(name)
@@ -75,7 +76,7 @@ def waiting_message(name: str) -> str:
 
 
 def absence(name: str, role: Role, joined: Run | None = None) -> str:
-    """Message about a process without a link: it is starting, hangs, is stopped or absent, or its run was restarted.
+    """Message about a process without a link: it is starting, hangs, is suspended or absent, or its run was restarted.
 
     `joined` is the run as this process joined it; None if it has not.
     """
@@ -84,7 +85,7 @@ def absence(name: str, role: Role, joined: Run | None = None) -> str:
     roles = live_runs().get(name, set())
     if role in roles and not open_run(name, ()).links.network.router:  # across hosts, only the router is seen
         return (
-            f"the {role} of run {name!r} does not answer, but its port is in use: it is starting, hangs or is stopped"
+            f"the {role} of run {name!r} does not answer, but its port is in use: it is starting, hangs or is suspended"
         )
     if Role.LAUNCHER in roles and role is Role.RECORDER:
         return f"run {name!r} has no {role}: it is starting, or was started with --no-record"
