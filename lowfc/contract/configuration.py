@@ -66,8 +66,8 @@ class Control(Section):
     """Loop mode once a calibration is loaded; with automatic gains, closed takes effect once these are measured.
     sim-loop starts closed if the file does not set this key."""
     delay_frames: float = Field(0.0, ge=0, le=10)
-    """Measured delay in frames, counted as camera.delay_frames is; 0: its value. Doubling the delay about halves the
-    highest stable gain."""
+    """Measured delay in frames, counted as camera.delay_frames is; 0: the value of that key. Doubling the delay about
+    halves the highest stable gain."""
     estimator: Literal["weighted", "pinv"] = "weighted"
     """Pseudo-inverse of H. weighted: noise-weighted; pinv: plain."""
     nuisance: list[Literal["background", "shear"]] = Field(default_factory=list)
@@ -88,8 +88,8 @@ class Control(Section):
     limit_nm: ModalLimit = 50.0
     """Largest modal command of the other modes, wavefront rms."""
     max_frame_age_ms: Milliseconds = 0.0
-    """Age above which a frame is refused; 0: 20 ms or two frame periods, whichever is longer. A frame whose age on
-    arrival is above both 5 ms and three periods is refused in any case."""
+    """Age above which a frame is refused; 0: 20 ms or two frame periods, whichever is longer. In any case a frame is
+    refused if its age on arrival is above both 5 ms and three periods, or, if it waited behind another, one period."""
     frame_timeout_ms: Milliseconds = 0.0
     """Time without a frame after which an event is raised; 0: 50 ms or five frame periods, whichever is longer."""
     on_frame_timeout: Literal["hold", "flat"] = "hold"

@@ -80,6 +80,6 @@ class Network(Section):
 
 
 def _address(endpoint: str) -> tuple[str, int]:
-    """Host and port of an endpoint such as "tls/bench:7447"; no host and port 0 without one."""
+    """Host and port of an endpoint such as "tls/bench:7447"; "" and 0 if the endpoint is empty."""
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     return host.strip("[]"), int(port or 0)

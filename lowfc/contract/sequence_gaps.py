@@ -16,7 +16,7 @@ class Gaps:
     """
 
     def __init__(self, first: int, missing: int = 0) -> None:
-        """Begin with the count of the first message; `missing` is the number of missing ones of former starts."""
+        """Begin with the count of the first message; `missing` is the number of messages missing from former starts."""
         self.first = self.next = first
         self.missing = missing
         self._open: set[int] = set()

@@ -5,11 +5,11 @@ import tomllib
 from typing import Any
 
 MAX_BYTES = 1 << 20
-"""Largest size of a configuration; one with every key and its description has 14 kB."""
+"""Largest size of a configuration; one with every key and its description has 16 kB."""
 
 _MAX_DOTS = 100  # in a line: the time to parse a dotted key grows with the square of the number of its parts
 _NUMBER = re.compile(r"[0-9]\.[0-9_]++(?:[eE][+-]?[0-9_]++)?(?![\w.-])")
-"""A number with a fraction; its dot is not counted. In a dotted key of digits, almost half of the dots are counted."""
+"""A number with a fraction; its dot is not counted. In a dotted key of digits, about half of the dots are, or more."""
 
 
 def parsed(content: bytes) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from lowfc.control.loop.state import ActiveLoop, Conditions, LawRunner, Settings
 
 # Fields of the same name in values and messages.
 _LIMITS = ("stroke_nm", "slew_nm", "neighbour_nm")
-_PAIRS = ("gain", "leak", "limit_nm")
+_PAIRS = ("gain", "leak", "limit_nm")  # settings have a value for tip and tilt, and one for the other modes
 _SETTINGS = (
     *("delay_frames", "max_frame_age_ns", "frame_timeout_ns", "on_frame_timeout", "rate_hz", "guard"),
     *("min_flux_fraction", "max_saturated_pixels", "max_identical_frames"),
@@ -89,7 +89,7 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
 
 
 def calibration_in_use(message: wire.ControllerState, calibration: Calibration) -> Calibration:
-    """The calibration with the reconstructor in use, to which automatic gains may have added a prior of other modes."""
+    """The calibration with the reconstructor in use; automatic gains may have given it a prior of uncorrected modes."""
     prior_nm2 = np.array(message.prior_nm2, np.float32)
     if message.calibration_id != calibration.id or prior_nm2.size != len(calibration.noll):
         return calibration
@@ -110,7 +110,7 @@ def decode_state(
     `kernel` returns the kernel of a name; without it, the reference implementation is used.
 
     Raises:
-        ValueError: the message is incomplete, the calibration is another one, or its law or table is missing.
+        ValueError: the message is incomplete, the calibration is another one, or the law or a table is missing.
     """
     settings = _decode_settings(message.settings, kernel)
     loop = None
@@ -152,7 +152,7 @@ def decode_state(
         frame_time_ns=from_timestamp(message.frame_timestamp),
         refused=Rejection(message.refused) if message.refused else None,
         limits_hit=tuple(reason_of(reason) for reason in message.limits_hit),
-        counts={reason_of(line.reason): line.count for line in message.counts},
+        counts={reason_of(counted.reason): counted.count for counted in message.counts},
         estimate=Estimate(np.array(message.measured_nm, np.float32), message.flux_dn) if message.measured_nm else None,
         conditions=Conditions(
             camera=camera_settings(message.camera) if message.HasField("camera") else None,
