@@ -28,7 +28,7 @@ class Calibration:
         response: (pixels, modes) H in flux fractions per nm of wavefront rms.
         reconstructor: (modes, pixels) R in nm per flux fraction; zero at bad pixels.
         good: (pixels,) 1 for a used pixel, else 0.
-        dark: (pixels,) DN.
+        dark: (pixels,) dark image, DN.
         modes_to_actuators: (actuators, modes) nm of surface per nm of wavefront rms; includes the 1/2 of reflection.
         actuators_to_modes: (modes, actuators) nm of wavefront rms that R measures per nm of surface; empty if unknown.
         shape: rows and columns of the frame.
@@ -37,7 +37,7 @@ class Calibration:
         saturation_dn: highest value a pixel can have.
         estimator: how R was computed: weighted or pinv, and fitted nuisance parameters, as in weighted+shear.
         wavelength_nm: wavelength of H.
-        operator_hash: hash of the optical model from which it was computed; empty for a measured calibration.
+        operator_hash: hash of the optical model that the calibration was computed from; empty for a measured one.
         id: identity of the calibration.
         camera: camera settings with which it was made; None if unknown.
     """
@@ -127,7 +127,7 @@ def normalise_flux(reference: Array, response: Array, good: Array) -> tuple[Arra
 
 
 def for_unnormalised_images(reconstructor: Array, reference: Array, good: Array) -> Array:
-    """R' (modes, pixels) for images not divided by their flux: R' H = R N, H in I0's unit per nm, N normalised H."""
+    """R' (modes, pixels) for images not divided by their flux: R' H = R N with H in I0's unit per nm, N normalised."""
     flux = _flux(reference, good)
     return np.asarray((reconstructor - np.outer(reconstructor @ reference / flux, good)) / flux)
 
@@ -148,7 +148,7 @@ def reconstructor(
     estimator: str = "weighted",
     nuisance: Array | None = None,
 ) -> Array:
-    """R (modes, pixels) from normalised I0 and H: error = R (I - I0), least squares as in the paper's eq. (11).
+    """R (modes, pixels) from normalised I0 and H: error = R (I - I0), least squares, eq. (11) of Subedi et al. 2015.
 
     `weighted` is (H' W H)^-1 H' W with W = 1 / (I0 + read_noise^2) in electrons. It is the unbiased linear estimate
     with the least noise, if the noise of the flux by which a frame is divided is neglected. `pinv` weights all pixels

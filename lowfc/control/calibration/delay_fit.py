@@ -74,8 +74,8 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
     snr = float(np.sqrt(power))
     if snr < MIN_SNR:
         raise NotSeenError(
-            "the pokes are not seen in the frames: is the light on the sensor, does the mirror follow the commands, is "
-            "the amplitude too small for the disturbance?"
+            "the pokes are not seen in the frames: is there light on the sensor, does the mirror follow the commands, "
+            "is the amplitude too small for the disturbance?"
         )
     pairs = factors[:-1] + factors[1:]
     whole = int(pairs.argmax())

@@ -1,4 +1,4 @@
-"""Probe signals to measure a loop: multisines, each line of which belongs to one mode, and staircases of one mode.
+"""Probe signals to measure a loop: multisines, whose lines (frequencies) each belong to one mode; staircases.
 
 All lines of a multisine are odd multiples of the inverse of its period, so that products of a second-order
 nonlinearity fall between them. No two lines are neighbours, so that Hann's window separates them.

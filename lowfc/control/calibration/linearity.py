@@ -50,11 +50,11 @@ class Gains:
         beyond = np.abs(self.gain - own) > limit + SIGMAS * self.error
         unsure = self.error > limit / 2
         rows = zip(beyond, unsure, strict=True)
-        return [False if far.any() else None if vague.any() else True for far, vague in rows]
+        return [False if is_beyond.any() else None if is_unsure.any() else True for is_beyond, is_unsure in rows]
 
 
 def gains(error_nm: Array, mode: int, levels_nm: Array, starts: Integers, frames: int) -> Gains:
-    """Gain and cross-talk of a mode, from open-loop errors (frames, modes), nm, on a staircase of `levels` (levels,).
+    """Gain and cross-talk of a mode, from open-loop errors (frames, modes), nm, on a staircase of levels (levels,), nm.
 
     At each level, the errors are averaged over `frames` frames; `starts` (levels,) has the index of the first of them.
     A standard error needs two cycles or more.

@@ -270,8 +270,8 @@ class Check(NamedTuple):
     def within(self, rms: float, largest: float) -> bool:
         """Whether the cross-talk is below these limits, within the noise of these frames."""
         modes = len(self.error)
-        unsure = _MEAN_SQUARE_ERRORS * float(np.sqrt(2 * (self.error**4).sum() / modes**3))  # of the mean square
-        return bool(self.rms**2 <= rms**2 + unsure and self.largest <= self.bound(largest))
+        mean_square_tolerance = _MEAN_SQUARE_ERRORS * float(np.sqrt(2 * (self.error**4).sum() / modes**3))
+        return bool(self.rms**2 <= rms**2 + mean_square_tolerance and self.largest <= self.bound(largest))
 
     def bound(self, largest: float) -> float:
         """Largest element that these frames may show, with their noise, if no true element is above `largest`."""

@@ -1,4 +1,4 @@
-"""From measured modes to the next command: the reference in numpy, and the fused step for normal frames."""
+"""From measured modes to the next command: by numpy (the reference), or for normal frames by the fused step."""
 
 import numpy as np
 
@@ -128,7 +128,7 @@ def _update_guard(
 def next_command(
     settings: Settings, state: State, loop: ActiveLoop, error_nm: Single, sequence: int
 ) -> tuple[ActiveLoop, tuple[Reason, ...], bool]:
-    """The loop with its command after an error (modes,), the limits that acted, and the next `returning_to_zero`."""
+    """The loop with the command for an error (modes,), the limits that acted, and whether it still returns to zero."""
     if state.mode is LoopMode.SAFE:
         return step_to_flat(settings, loop), (), False
     channels, returning_to_zero = loop.command_channels, state.returning_to_zero

@@ -163,19 +163,19 @@ class GainBank:
         """
         if self.first or len(self._excesses) < EARLY_BLOCKS:
             return gain
-        now = self._row_of(gain)
+        current = self._row_of(gain)
         cross_talk_nm, suspected_nm = self._cross_talk_nm(self._tilts[-EARLY_BLOCKS:])
-        if (now > 1).all() and not cross_talk_nm.any():
+        if (current > 1).all() and not cross_talk_nm.any():
             return gain  # no mode can change: in most cases the rest is not computed
         blocks = self._with_cross_talk_margin(suspected_nm)[:, :-1]
-        own = blocks[:, now, np.arange(now.size)]
-        beyond = blocks - own[:, None]
-        mean = np.where(now == 0, beyond.mean(axis=0), beyond[-EARLY_BLOCKS:].mean(axis=0))
-        proven = np.where(now == 0, self._beyond_noise(mean), (beyond[-EARLY_BLOCKS:] < 0).all(axis=0))
+        own = blocks[:, current, np.arange(current.size)]
+        difference = blocks - own[:, None]
+        mean = np.where(current == 0, difference.mean(axis=0), difference[-EARLY_BLOCKS:].mean(axis=0))
+        proven = np.where(current == 0, self._significantly_lower(mean), (difference[-EARLY_BLOCKS:] < 0).all(axis=0))
         proven_mean = np.where(proven, mean, np.inf)
-        changed = (now <= 1) & proven.any(axis=0)
+        changed = (current <= 1) & proven.any(axis=0)
         only_cross_talk = (cross_talk_nm != 0) & (own[-EARLY_BLOCKS:] > 0).all(axis=0)
-        gain = np.where(changed, self.rows[np.argmin(proven_mean, axis=0), np.arange(now.size)], gain)
+        gain = np.where(changed, self.rows[np.argmin(proven_mean, axis=0), np.arange(current.size)], gain)
         return np.where(only_cross_talk, 0, gain).astype(np.float32)
 
     def held(self, frames: int) -> None:
@@ -189,11 +189,11 @@ class GainBank:
         means, power = (np.mean(values, axis=0, dtype=float) for values in (self._means, self._powers))
         cross_talk_nm, suspected_nm = self._cross_talk_nm(self._tilts)
         power -= (2 * means - cross_talk_nm) * cross_talk_nm
-        now = self._row_of(gain)
+        current = self._row_of(gain)
         modes = np.arange(gain.size)
         frames = self._block * BLOCKS
         mean, error = _mean(self._without_cross_talk(cross_talk_nm))
-        chosen = self._chosen(self._with_cross_talk_margin(suspected_nm), now)
+        chosen = self._chosen(self._with_cross_talk_margin(suspected_nm), current)
         if noise_nm2 is not None:
             noise_nm2 = np.maximum(noise_nm2, np.mean(self._noises, axis=0))
         if self.first and noise_nm2 is not None:
@@ -205,13 +205,13 @@ class GainBank:
             self.rows[chosen, modes],
             power,
             noise_nm2,
-            mean[now, modes],
-            error[now, modes],
+            mean[current, modes],
+            error[current, modes],
             mean[-1] if self._closed_throughout else None,
             error[-1],
             frames,
         )
-        if self.first or (chosen != now).any():
+        if self.first or (chosen != current).any():
             self.first = False
             self._clear(self._windows[1])
         else:
@@ -237,27 +237,27 @@ class GainBank:
         return blocks
 
     def _with_cross_talk_margin(self, cross_talk_nm: Array) -> Array:
-        """The same mean squares, with cross-talk (modes,) times `MARGIN` if it is against a gain, else without it."""
+        """As `_without_cross_talk`, with cross-talk (modes,) times `MARGIN` where it is against a gain, else with 0."""
         against = np.mean(self._means, axis=0) * cross_talk_nm > 0
         return self._without_cross_talk(np.where(against, MARGIN * cross_talk_nm, 0))
 
-    def _chosen(self, blocks: Array, now: Integers) -> Integers:
-        """Best row (modes,) of each mode whose current row is `now`."""
-        virtual, modes = blocks[:, :-1], np.arange(now.size)
+    def _chosen(self, blocks: Array, current: Integers) -> Integers:
+        """Best row (modes,) of each mode; `current` is the row in use."""
+        virtual, modes = blocks[:, :-1], np.arange(current.size)
         rows, helps = virtual + self._median_of_modes(virtual), (virtual.mean(axis=0) < 0) & self._distinct
         if self.first:
-            beyond_open = rows.mean(axis=0)
-            better = helps & self._beyond_noise(beyond_open)
-            return np.where(better.any(axis=0), np.argmin(np.where(better, beyond_open, np.inf), axis=0), 0)
-        beyond_now, better = _better(rows - rows[:, now, modes][:, None])
-        better = helps & np.where(now == 0, self._beyond_noise(beyond_now), better)
-        better[0] = _better(-virtual)[1][now, modes]
-        best = np.argmin(np.where(better, beyond_now, np.inf), axis=0)
-        best = np.where(better.any(axis=0), best, now)
-        near = np.clip(best, np.maximum(now - 1, 0), now + 1)
-        return np.where((now <= 1) | better[0], best, near)
+            from_open = rows.mean(axis=0)
+            better = helps & self._significantly_lower(from_open)
+            return np.where(better.any(axis=0), np.argmin(np.where(better, from_open, np.inf), axis=0), 0)
+        from_current, better = _better(rows - rows[:, current, modes][:, None])
+        better = helps & np.where(current == 0, self._significantly_lower(from_current), better)
+        better[0] = _better(-virtual)[1][current, modes]
+        best = np.argmin(np.where(better, from_current, np.inf), axis=0)
+        best = np.where(better.any(axis=0), best, current)
+        near = np.clip(best, np.maximum(current - 1, 0), current + 1)
+        return np.where((current <= 1) | better[0], best, near)
 
-    def _beyond_noise(self, mean: Array) -> Mask:
+    def _significantly_lower(self, mean: Array) -> Mask:
         """Whether a mean over the blocks minus that of gain 0 (rows, modes) is lower than white noise explains.
 
         Commands do not depend on the noise of later frames, so the differences of frames are independent.

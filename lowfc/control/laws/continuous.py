@@ -117,7 +117,7 @@ def residual_spectrum(law: LinearLaw, omega: Array, measured: Array, noise_nm2: 
 
 
 def commanded(law: LinearLaw, omega: Array, delay: float) -> Complex:
-    """Command (frequencies, modes) from a frame that measures e^(i w t_k), relative to this; omega in rad per frame."""
+    """Command (frequencies, modes) from a frame that measures e^(i w t_k), as its multiple; omega in rad per frame."""
     return _commanded(sensitivity(law, omega, delay), omega, delay)
 
 
@@ -167,9 +167,9 @@ def held_residual_nm2(
     """
     ahead_nm, response = means_while_applied(measured_nm, timing)
     rows = np.isfinite(ahead_nm).all(axis=1)
-    own = commanded(law, np.maximum(_FILTER_OMEGA, 1e-6), timing.delay)
-    passed = np.abs(response)[:, None] ** 2 + 2 * np.real(response[:, None] * own.conj())
-    by_noise_nm2 = noise_nm2 * np.trapezoid(passed, _FILTER_OMEGA, axis=0) / np.pi
+    command = commanded(law, np.maximum(_FILTER_OMEGA, 1e-6), timing.delay)
+    noise_gain = np.abs(response)[:, None] ** 2 + 2 * np.real(response[:, None] * command.conj())
+    by_noise_nm2 = noise_nm2 * np.trapezoid(noise_gain, _FILTER_OMEGA, axis=0) / np.pi
     squares = np.sum((ahead_nm[rows] + command_nm[rows]) ** 2, axis=0)
     return squares - rows.sum() * by_noise_nm2, int(rows.sum())
 

@@ -15,7 +15,7 @@ Signal = Literal["error", "pol"]
 _LARGEST_POLE = 0.99
 """Largest pole of an integrator of POL modes in an open loop while frames are missing; below 1, for stability."""
 MAX_STATES = 512
-"""Most states of a law: a step with this number takes about 50 us."""
+"""Largest number of states of a law; with it a step takes about 50 us."""
 SIGNALS: tuple[Signal, ...] = ("error", "pol")
 
 

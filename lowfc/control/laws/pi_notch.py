@@ -17,7 +17,7 @@ longer; with a smaller one, wrong states last longer."""
 
 
 class Notch(NamedTuple):
-    """A notch: at `frequency_hz`, the rejection is divided by `depth`.
+    """A notch: at `frequency_hz`, the rejection (error / POL) is divided by `depth`.
 
     `width_hz` is the width between its -3 dB points if the notch is deep (at a depth of 4, they are 6 % closer).
     Neighbouring notches deepen each other.
@@ -73,7 +73,7 @@ def pi_notch(
 def _block(
     gain: float, proportional: float, leak: float, notches: Sequence[Notch], delay_frames: float, rate_hz: float
 ) -> Block:
-    """Block of one mode, u = C s, s[k] = P s[k-1] + B e[k]; s is the integral, the error, a rotating pair per notch."""
+    """Block of one mode, u = C s, s[k] = P s[k-1] + B e[k]; s: integral, error and a rotating pair per notch."""
     weights = delay_weights(delay_frames)
     residues: list[tuple[complex, complex]] = []  # pole, residue
 

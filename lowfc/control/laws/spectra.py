@@ -39,9 +39,9 @@ class TimeSeries:
         """Number of frames in the longest piece; 0 without pieces."""
         return max((len(piece) for piece in self.values), default=0)
 
-    def columns(self, which: slice) -> "TimeSeries":
+    def columns(self, selected: slice) -> "TimeSeries":
         """A series of the same frames with only these columns."""
-        return TimeSeries(tuple(piece[:, which] for piece in self.values), self.interpolated)
+        return TimeSeries(tuple(piece[:, selected] for piece in self.values), self.interpolated)
 
     def joined(self) -> Array:
         """All frames (frames, columns), one piece after the other."""
@@ -112,7 +112,8 @@ def spectrum(series: TimeSeries, rate_hz: float, frames: int = 0) -> Spectrum | 
     """Welch's estimate over all pieces of at least a segment's length; None if there are none.
 
     Each segment's mean is subtracted, and Hann's window applied. A segment has `frames` frames or, if this is 0, a
-    power of two that follows from the longest piece. As `scipy.signal.welch`, whose import takes half a second.
+    power of two that follows from the longest piece. The result is that of `scipy.signal.welch`, whose
+    import takes half a second.
     """
     if series.longest < SHORTEST:
         return None
@@ -130,13 +131,13 @@ def spectrum(series: TimeSeries, rate_hz: float, frames: int = 0) -> Spectrum | 
     return Spectrum(frequency_hz, total.T / (segments * rate_hz * np.sum(window**2)), segments)
 
 
-def floor_nm2_hz(found: Spectrum) -> Array:
+def floor_nm2_hz(measured: Spectrum) -> Array:
     """Level (columns,) of white noise: the median over the upper half of the frequencies, without the median's bias.
 
     A median of chi-squared values lies below their mean; lines and slopes of the disturbance hardly move it.
     """
-    upper = found.power_nm2_hz[found.frequency_hz.size // 2 : -1]
-    freedom = 2 * found.segments
+    upper = measured.power_nm2_hz[measured.frequency_hz.size // 2 : -1]
+    freedom = 2 * measured.segments
     return np.asarray(np.median(upper, axis=0) / (1 - 2 / (9 * freedom)) ** 3)
 
 

@@ -21,12 +21,12 @@ FEWEST = 2048
 _LONGEST = 1 << 16  # frames of a segment
 _MAX_LINES = 12
 _SCALES = (3, 9, 27, 81)  # numbers of frequencies over which lines are searched
-_PENALTY = 2.5  # log-likelihood a line costs / log(frequencies): 1.5 for 3 parameters (BIC), 1 for choosing a frequency
-_SHARE = 0.3  # a narrower line is preferred if it reaches this part of the largest gain in likelihood
+_PENALTY = 2.5  # cost of a line in log-likelihood / log(frequencies): 1.5 for its 3 parameters (BIC), 1 for the choice
+_NARROW_SHARE = 0.3  # a narrower line is preferred if it reaches this part of the largest gain in likelihood
 _HANN = 1.5  # under Hann's window neighbouring frequencies are correlated: three count as two
 _LOBE = 12  # frequencies on either side of a line into which the window spreads the line
-_FULL = 40  # frequencies on either side of a line, and from 0 on, that are not averaged
-_PER_DECADE = 48  # groups of averaged frequencies
+_UNAVERAGED = 40  # frequencies on either side of a line, and from 0 on, that are not averaged
+_PER_DECADE = 48  # groups of averaged frequencies in a decade
 _MIN_DRIFT = 1e-8  # ratio of variances of the drift's step and the noise: a constant is followed in 10^4 frames
 _MIN_NOISE = 1e-3  # least ratio of noise to the level at high frequencies: a filter needs some noise
 
@@ -178,10 +178,10 @@ class _Whittle:
     def grouped(self, lines: tuple[Line, ...], robust: bool) -> tuple[Array, Array, Array]:
         """Means of frequency and power, and count, of groups: single frequencies near lines and 0, else logarithmic."""
         places = np.arange(self.omega.size)
-        group = _FULL + np.floor(_PER_DECADE * np.log10(np.maximum(places, 1)))
-        single = places < _FULL
+        group = _UNAVERAGED + np.floor(_PER_DECADE * np.log10(np.maximum(places, 1)))
+        single = places < _UNAVERAGED
         for line in lines:
-            near = max(_FULL * self.spacing_hz, 4 * line.width_hz)
+            near = max(_UNAVERAGED * self.spacing_hz, 4 * line.width_hz)
             single |= np.abs(self.frequency_hz - line.frequency_hz) < near
         fresh = np.diff(group, prepend=-1) != 0
         fresh |= single | np.concatenate([[True], single[:-1]])
@@ -245,13 +245,15 @@ class _Whittle:
         if largest < _PENALTY * np.log(ratio.size):
             return None
         # Take the narrowest line with a fair share of the gain: a wide one could be two separate lines.
-        place, scale = next((place, scale) for gain, place, scale in candidates if gain >= _SHARE * largest)
+        place, scale = next((place, scale) for gain, place, scale in candidates if gain >= _NARROW_SHARE * largest)
         if scale == _SCALES[0]:  # of the three frequencies, take the one with the highest power
             place += int(np.argmax(self.power[place - 1 : place + 2])) - 1
-        near = slice(max(place - max(_FULL, 3 * scale), 0), place + max(_FULL, 3 * scale) + 1)
+        reach = max(_UNAVERAGED, 3 * scale)
+        near = slice(max(place - reach, 0), place + reach + 1)
         return self._fit_line(near, place, scale, spectrum[near])
 
     def _fit_line(self, near: slice, place: int, scale: int, background: Array) -> Line:
+        """Fit a line around the frequency of index `place`, above the `background` at the frequencies `near`."""
         omega, power, step = self.omega[near], self.power[near], 2 * np.pi / self.rate_hz
         excess = self.power[max(place - scale, 0) : place + scale + 1].sum() / self.power.size
 
@@ -344,7 +346,7 @@ def _per_frame(line: Line, rate_hz: float) -> tuple[float, float, float]:
 
 
 def _line(omega: Array, centre: float, decay: float, variance_nm2: float) -> Array:
-    """Spectrum of a process with the covariance variance decay^k cos(centre k)."""
+    """Spectrum of a process whose covariance at lag k is variance_nm2 decay^k cos(centre k)."""
     lost = (1 - decay) ** 2  # |1 - decay e^(i x)|^2 = (1 - decay)^2 + 4 decay sin^2(x/2), without cancellation
     near, far = (lost + 4 * decay * np.sin((omega + sign * centre) / 2) ** 2 for sign in (-1, 1))
     return np.asarray(variance_nm2 * (1 - decay**2) / 2 * (1 / near + 1 / far))

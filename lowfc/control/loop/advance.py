@@ -194,7 +194,7 @@ def _measure(
 
 
 def _overruled(state: State, loop: ActiveLoop) -> bool:
-    """Whether the integrator determines part of a closed loop's command because the law had a larger error."""
+    """Whether the integrator determines part of a closed loop's command because the guard overruled the law."""
     guard = loop.law_runner.guard if loop.law_runner is not None else None
     return guard is not None and state.mode is LoopMode.CLOSED and guard.overruled
 

@@ -2,8 +2,8 @@
 
 A channel is a mirror shape from a source other than the control law, such as one that digs a dark hole. The sensor sees
 it, so the sensor's zero point shifts with it (Subedi et al. 2015, Sect. 1 and 4), after the delay of a command, and the
-loop does not remove it. Two additions do not shift the zero point: the channel `FLAT`, and a probe sequence ("play"),
-which is for calibration and tests.
+loop does not remove it. Two kinds of shape do not shift the zero point: the channel `FLAT`, and a probe sequence
+("play"), which is for calibration and tests.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ EXTERNAL = "external"
 """Channel of shapes that other programs apply to the mirror: the loop does not command it."""
 MAX_CHANNELS = 16
 MAX_PROBE_NUMBERS = 1 << 24
-"""Most numbers in the table of a probe sequence, and most numbers in its basis."""
+"""Largest number of elements in the table of a probe sequence, and in its basis."""
 MIRROR, OFFSET = "mirror", "offset"
 """Targets of a probe sequence."""
 MAX_NAME_LENGTH = 32  # characters

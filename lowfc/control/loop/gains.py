@@ -84,7 +84,7 @@ def per_mode(noll: tuple[int, ...], request: Request, before: Single) -> Single:
     """Values of all modes (modes,), in their unit, updated with those of the request.
 
     Raises:
-        ValueError: the request is wrong; the text says in what.
+        ValueError: the request is wrong; the text names the fault.
     """
     modes = _modes(noll, request)
     if len(request.values) not in (1, len(modes)):

@@ -1,7 +1,7 @@
-"""The guard of a linear law: an integrator on the same frames takes over if the law has larger errors.
+"""The guard of a linear law: an integrator takes over if the law has larger errors or amplifies the disturbance.
 
 Tip and tilt are judged apart from the other modes, as the larger group would hide the smaller. While the law drives a
-group, the integrator is virtual there (its commands and errors are only computed), and vice versa.
+group, the integrator is virtual there (only computed, from the same frames), and vice versa.
 
 Squared errors are compared in blocks of frames, and several blocks in a row decide: a step of the disturbance, from
 which a law may recover more slowly than the integrator, affects one or two blocks; shifted vibration lines affect all.
@@ -21,7 +21,7 @@ from lowfc.control.loop.inputs import PendingEvent
 BLOCK_S, MIN_BLOCK_FRAMES = 0.1, 100
 """Duration of a block, and its least number of frames."""
 WORSE_BLOCKS = 4
-"""Blocks in a row after which the integrator takes over."""
+"""Number of blocks in a row with a worse law or an amplifying loop after which the integrator takes over."""
 CROSS_FADE_S = 0.1
 """Duration of the cross-fade."""
 BETTER_S = 10.0

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 Value = bool | float | str
 MAX_TEXT_LENGTH = 200
-"""Most characters of a text value."""
+"""Largest number of characters of a text value."""
 
 
 class Action(StrEnum):

@@ -16,10 +16,10 @@ from lowfc.control.loop.wording import AUTO
 MAX_S = 60.0
 """Longest duration of a lease or permit without renewal, s."""
 MAX_HOLDER_LENGTH = 200
-"""Most characters of the holder's description."""
+"""Largest number of characters of the holder's description."""
 
 ENDED_BY = frozenset({"safe", "open", "pause", "stop"})
-"""Requests granted to every client; they end another client's lease, and `safe` also ends the client's own."""
+"""Requests that no lease refuses; they end another client's lease, and `safe` also ends the client's own."""
 UNRELATED = frozenset({"status", "note", "lease", "renew", "release", "permit"})
 """Requests that do not change the loop, and the requests for leases themselves."""
 LEASE_OVER = "the lease ended: "
@@ -54,7 +54,7 @@ class Lease(NamedTuple):
         return self.holder.rpartition(REMAINING_TIME_SEPARATOR)[0] or self.holder
 
     def expired(self, time_ns: int, frame_sequence: int) -> bool:
-        """Whether the time of the lease is over, by the clock or by the times of frames."""
+        """Whether the time of the lease is over, by the clock or by the sequence of a frame."""
         return time_ns > self.until_ns or (self.same_start(frame_sequence) and self.last_sequence < frame_sequence)
 
     def same_start(self, frame_sequence: int) -> bool:

@@ -21,9 +21,9 @@ from lowfc.control.loop.safety import MAX_LIMIT_NM, Limits, LoopMode, Rejection,
 from lowfc.control.loop.state import ActiveLoop, LawRunner, Settings, State
 from lowfc.control.loop.wording import AUTO, MAX_NOTE_LENGTH, PAUSED, counted
 
-MAX_STEPS = 1 << 32  # most frames of a request `step`
+MAX_STEPS = 1 << 32  # largest number of frames of a request `step`
 MAX_REPLY_LENGTH = 1000
-"""Most characters of a reply."""
+"""Largest number of characters of a reply."""
 
 
 def answer(settings: Settings, state: State, request: Request) -> tuple[State, Outputs]:
@@ -62,7 +62,7 @@ def _handler(request: Request, lease_before: Lease | None) -> "Handler":
 def prepared(settings: Settings, request: Request) -> Request:
     """Do the slow checks of a request that need no state; the process calls this where no frame waits for it.
 
-    A fault becomes its `refusal`. A prepared request is returned unchanged.
+    A fault becomes the request's `refusal`. A request that is prepared already is returned unchanged.
     """
     if request.prepared:
         return request

@@ -165,7 +165,7 @@ def limit(limits: Limits, previous_nm: Single, requested_nm: Single) -> Limited:
 
 
 def _shorten(limits: Limits, previous_nm: Single, kept_nm: Single) -> Single:
-    """Go from `previous_nm` towards `kept_nm` as far as neighbours allow; first shrink a `previous_nm` at a limit.
+    """Go from `previous_nm` towards `kept_nm` as far as neighbours allow, or only shrink it if it is at a limit.
 
     The result is half a margin further below the neighbour limit than `limit` requires: rounding could block a mirror
     that is exactly at it.
