@@ -57,7 +57,7 @@ def estimate(fit: Fit, image_e: Array) -> Array:
 
 
 def iterated(fit: Fit, image_e: Array, model: Model, iterations: int) -> list[Array]:
-    """Estimates (modes,) in nm after 0, 1, ... `iterations` with the full model: a <- a + R (I - I_model(a)).
+    """Estimates (modes,), nm, after 0 to `iterations` iterations with the full model: a <- a + R (I - I_model(a)).
 
     R is constant, the model is nonlinear. Two iterations suffice for wavefronts with the input rms of Table 3.
 

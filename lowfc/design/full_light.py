@@ -34,7 +34,7 @@ class FocalLight:
         forms: Quadratic forms of the pupil.
         fields: By wavelength, nm: (1 + modes, k, k) fields on the mask, of the pupil and of the pupil times each mode.
         wavefronts_nm: By the number of modes, (wavefronts, modes) random wavefronts matched to Table 3's input.
-        aberrated: By the number of modes, (wavefronts, k, k) fields of these on the mask, at the central wavelength.
+        aberrated: By the number of modes, (wavefronts, k, k) their fields on the mask, at the central wavelength.
     """
 
     forms: PupilForms
@@ -145,7 +145,7 @@ def sweep(merit_of: Callable[[float], float], low: float, high: float, count: in
     if low == high:
         return np.array([low]), low
     values = np.linspace(low, high, count)
-    at = int(np.argmin([merit_of(value) for value in values.tolist()]))
-    bounds = values[max(at - 1, 0)], values[min(at + 1, count - 1)]
+    best = int(np.argmin([merit_of(value) for value in values.tolist()]))
+    bounds = values[max(best - 1, 0)], values[min(best + 1, count - 1)]
     found = minimize_scalar(merit_of, bounds=bounds, method="bounded", options={"xatol": 1e-3 * (high - low)})
-    return values, float(min((found.x, values[at]), key=merit_of))
+    return values, float(min((found.x, values[best]), key=merit_of))

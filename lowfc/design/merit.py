@@ -36,7 +36,7 @@ class Signal:
         I0: (samples,) image of a flat wavefront, fraction of the open circle's light per pixel.
         H: (samples, modes) derivative of the image per nm rms of each mode.
         pixels_per_sample: Number of pixels that each sample represents.
-        peak: Largest value of I0: of a pixel, or in a band of a sample.
+        peak: Largest value of I0: on a pixel at one wavelength, on a sample in a band.
     """
 
     I0: Array

@@ -44,7 +44,7 @@ at most 42 % above them."""
 RELAY_SAMPLES = 128
 """Samples across the relay pupil."""
 SAMPLES_PER = 2
-"""Samples at the sensor per lambda0 / D: half as many as pixels, which still sample the image completely."""
+"""Samples at the sensor per lambda0 / D: half as many as pixels, but enough to sample the image completely."""
 _PIXELS_PER_SAMPLE = (PIXELS_PER / SAMPLES_PER) ** 2
 
 

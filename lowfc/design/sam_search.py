@@ -116,19 +116,19 @@ def advance(optics: Optics, goal: Goal, bounds: Bounds, chain: Chain) -> Chain:
         move = _move(rng, bounds, orbits, progress)
         if move is None:
             continue
-        at, orbit = move
-        field = None if orbit is None else orbit_fields(optics, orbit, bounds.symmetry)
-        changed = total if at is None else total - fields[at]
+        removed, added = move
+        field = None if added is None else orbit_fields(optics, added, bounds.symmetry)
+        changed = total if removed is None else total - fields[removed]
         changed = changed if field is None else changed + field
         value = merit(SamCandidate(optics, changed), goal)
         # The change is relative: a layout 1 % worse is accepted equally often at any merit.
         accepted = value < current or (value < inf and rng.random() < exp(-log(value / current) / temperature))
         if not accepted:
             continue
-        if at is not None:
-            del orbits[at], fields[at]
-        if orbit is not None and field is not None:
-            orbits.append(orbit)
+        if removed is not None:
+            del orbits[removed], fields[removed]
+        if added is not None and field is not None:
+            orbits.append(added)
             fields.append(field)
         total, current = changed, value
         if current < best_merit:
