@@ -11,7 +11,7 @@ from lowfc.device.driver import Camera, CameraExtras, CameraSettings, Exposure, 
 from lowfc.device.watch import DriverWatch, opening
 
 WAIT_S = 30.0
-"""Time that the first frame waits for the processes that need it."""
+"""Longest time for which the first frame waits for the processes that need it."""
 SETTINGS_NS = round(1e9 / float(CAMERA_STATE.rate))
 """Period of the published settings, and of the events on lost frames."""
 PATIENCE_S = 1.0
@@ -156,7 +156,7 @@ class CameraLoop:
         if number is not None and self._number is not None:
             step = (number - self._number) % int(settings.number_wrap)
             if step == 0:
-                raise ValueError(f"it returned frame number {number} twice")
+                raise ValueError(f"it returned two frames with the number {number}")
             max_step = MAX_LOST_FRAMES + MAX_RATE_RATIO * (now_ns - self._number_ns) // int(settings.period_ns)
             if step > max_step:  # a restart: the controller then waits for the settings
                 self._service.bus.restart()

@@ -203,15 +203,15 @@ class MirrorLoop:
         """Call a method of the driver and return the shape that it returns, copied; None if it returns none.
 
         _LostError if it failed or hung: the position is then unknown until the driver moves the mirror again.
-        LowfcError as raised by the driver.
+        A LowfcError of the driver is raised unchanged.
         """
         self.watch.begin()
         try:
             shape_nm = method(*arguments)
             if shape_nm is not None:
                 shape_nm = np.array(shape_nm, np.float32, order="C")  # a driver may use its array again
-                if shape_nm.shape != self._protection.grid:
-                    raise ValueError(f"it returned {shape_nm.shape} actuators, expected {self._protection.grid}")
+                if shape_nm.shape != (grid := self._protection.grid):
+                    raise ValueError(f"it returned positions of shape {shape_nm.shape}, expected {grid}")
                 if not finite(shape_nm):
                     raise ValueError("it returned positions that are NaN or infinite, expected nm of surface")
             if self.watch.returned():

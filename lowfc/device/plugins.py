@@ -40,7 +40,7 @@ def load(kind: Kind, name: str) -> Any:
                     f"the driver {name!r} cannot be loaded: file and class must have names of letters, digits and _, "
                     "as in folder/my_camera.py:MyCamera: rename the file or the class"
                 )
-            # also with `python -P`, whose search path has no current folder
+            # Needed with `python -P`, whose search path has no current folder.
             sys.path.insert(0, str(Path(module).resolve().parent if module.endswith(".py") else Path.cwd()))
             point = EntryPoint(name, f"{section(name)}:{attribute}", f"lowfc.{kind}s")
         elif name in (drivers := installed(kind)):
@@ -69,7 +69,8 @@ def section(name: str) -> str:
 def opened(kind: Kind, name: str, config: Configuration, arguments: Sequence[str] = (), driver: Any = None) -> Any:
     """Open a driver with the options of the configuration, overridden by `arguments` (--key value, --key=value).
 
-    `driver` is its class, if known. ConfigurationError if it cannot be loaded or opened, or an option is wrong.
+    `driver` is the driver's class, if it is loaded already. ConfigurationError if it cannot be loaded or opened, or an
+    option is wrong.
     """
     driver = load(kind, name) if driver is None else driver
     values = options(driver, table(config, kind, name), arguments)

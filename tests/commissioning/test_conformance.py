@@ -524,7 +524,7 @@ def test_the_check_of_health_names_the_drivers_failure_and_the_expected_process(
 
 
 def test_a_mirror_state_without_actuators_is_explained_by_the_drivers_failure() -> None:
-    why = "DRIVER_FAILED the driver failed and will be tried again: ValueError: it returned () actuators"
+    why = "DRIVER_FAILED the driver failed and will be tried again: ValueError: it returned positions of shape ()"
     failed = Mirror(state=setting(actuators=b""), health=setting(driver_failures=1, last_warning=why))
     checks = mirror_checks(Dialogue(failed, Expected(CONFIG)), 0.2, lambda _: None)
     assert [check.advice for check in checks if check.name == "grid"] == [why]

@@ -15,7 +15,7 @@ WAIT_MS = 500
 """Longest wait for a frame."""
 MAX_QUEUED = 2
 """Number of newest frames that may wait for the process. Older ones are dropped and count as lost: frames that arrive
-while the process is stopped all see the same mirror shape."""
+while the process is suspended all see the same mirror shape."""
 
 
 class GenicamOptions(DriverOptions):

@@ -81,7 +81,7 @@ class IsioMirror:
         return self._beside[1]
 
     def apply(self, actuators_nm: Single) -> Single | None:
-        """Write the channel (rows, columns); return its part of the sum if updated in time and different, else None."""
+        """Write the channel (rows, columns); return its part of a sum updated in time if this differs, else None."""
         self._reopen()
         self._check_writer()
         total = self._current_total()
