@@ -103,7 +103,7 @@ DECLARED: tuple[Declaration, ...] = (
     _declared(
         "law",
         "Let a linear law drive the mirror: it first observes, then takes over in a cross-fade; a law that is "
-        "unstable, or made for another rate or other modes, is refused.",
+        "unstable, or made for another rate, other modes or (from POL) another delay, is refused.",
         "law lqg.fits",
         ("law", "the linear law; none for the integrator"),
     ),

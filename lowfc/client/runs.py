@@ -11,7 +11,7 @@ _COMMANDS = {Role.CONTROLLER: "lowfc controller", Role.RECORDER: "lowfc record",
 
 
 def running() -> list[str]:
-    """Names of this user's runs on this host whose controller is listening; a killed run does not count."""
+    """Names of this user's runs on this host whose controller, or router, is listening; a killed run does not count."""
     return [name for name, roles in live_runs().items() if Role.CONTROLLER in roles]
 
 
@@ -95,7 +95,9 @@ def absence(name: str, role: Role, joined: Run | None = None) -> str:
 
 
 def live_runs(required: str | None = None) -> dict[str, set[str]]:
-    """Runs with a listening process, and their roles; a damaged run is omitted unless it is the required one.
+    """Runs with a listening process, and its roles; if that is a router, all roles, as any may be running.
+
+    A damaged run is omitted unless it is the required one.
 
     Raises:
         BusError, DataFileError: the required run is damaged.

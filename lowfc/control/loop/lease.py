@@ -76,9 +76,10 @@ class Lease(NamedTuple):
 def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:
     """Why a request is refused; empty if it is granted.
 
-    While a lease is in force, requests of other clients are refused. After its end, requests of the former holder are
-    refused, so that it does not act against the client that ended the lease. `lease` is the last lease, in force or
-    ended; `lease_id` is the identity in the request, 0 for none; the time is the controller's.
+    `ENDED_BY` and `UNRELATED` are granted. While a lease is in force, all other requests of other clients are refused;
+    after its end those of the former holder, so that it does not act against the client that ended the lease. `lease`
+    is the last lease, in force or ended; `lease_id` is the identity in the request, 0 for none; the time is the
+    controller's.
     """
     if name in ENDED_BY or name in UNRELATED:
         return ""

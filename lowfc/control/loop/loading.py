@@ -70,9 +70,9 @@ def loaded(
     state = state._replace(loop=loop)
     # A loop that an interlock holds may stay closed.
     acting = tuple(interlock for interlock in state.conditions.acting if interlock.action is not Action.HOLD)
-    if mode is not LoopMode.SAFE and (wrong := uncalibrated(state)):
+    if mode is not LoopMode.SAFE and (wrong := uncalibrated_cause(state)):
         mode, cause = LoopMode.IDLE, wrong
-    elif mode is LoopMode.CLOSED and (wrong := misfit(state)):
+    elif mode is LoopMode.CLOSED and (wrong := misfit_cause(state)):
         mode, cause = LoopMode.OPEN, f"{CAMERA_MISFIT}: {wrong}"
     elif mode is LoopMode.CLOSED and (wrong := refusal(acting, "close")):
         mode, cause = LoopMode.OPEN, wrong
@@ -86,7 +86,7 @@ def safe_pending(settings: Settings, state: State) -> bool:
     return settings.start_mode is LoopMode.SAFE and state.loop is None and not state.conditions.clear_id
 
 
-def misfit(state: State) -> str:
+def misfit_cause(state: State) -> str:
     """Why the camera's last received settings do not fit the calibration; empty if they do.
 
     A calibration that has no settings yet fits any settings with its shape and saturation.
@@ -99,7 +99,7 @@ def misfit(state: State) -> str:
     return "; ".join(changes(camera, calibrated))
 
 
-def uncalibrated(state: State) -> str:
+def uncalibrated_cause(state: State) -> str:
     """Why no mode can be measured: no calibration, or one computed for another frame size; empty otherwise."""
     loop, camera = state.loop, state.conditions.camera
     hint = ": `lowfc commission` measures one"
@@ -179,7 +179,7 @@ def mirror_shape_reported(settings: Settings, state: State, shape: MirrorShape) 
     loop, safe_cause = state.loop, MIRROR_WAS_SAFE if shape.safe else ""
     if loop is None:  # probe sequences and channels need no calibration
         loop = ActiveLoop.at_rest(settings, Calibration.none(shape.actuators_nm.shape))
-        events.append(PendingEvent("NOT_CALIBRATED", {"why": uncalibrated(state)}))
+        events.append(PendingEvent("NOT_CALIBRATED", {"why": uncalibrated_cause(state)}))
         safe_cause = safe_cause or (LATCHED if safe_pending(settings, state) else "")
     if safe_cause:
         state = _changed(state, LoopMode.SAFE, shape.time_ns, safe_cause, events)
@@ -250,21 +250,21 @@ def end_probe(loop: ActiveLoop, sequence: int, why: str, events: list[PendingEve
 
 
 def camera_reported(settings: Settings, state: State, camera: CameraSettings) -> tuple[State, Outputs]:
-    """Store the camera's settings; open a closed loop that they do not fit; enter or leave idle, see `uncalibrated`."""
+    """Store the camera's settings; open a closed loop if they do not fit; enter or leave idle: `uncalibrated_cause`."""
     after = _with_camera(state, camera)
     if after is state:
         return state, Outputs()
-    wrong = misfit(after)
+    wrong = misfit_cause(after)
     events: list[PendingEvent] = []
     mode, cause = after.mode, "the camera's frames fit the calibration"
-    if wrong and wrong != misfit(state):
+    if wrong and wrong != misfit_cause(state):
         events.append(PendingEvent("CAMERA_CHANGED", {"what": wrong}))
         cause = f"{CAMERA_MISFIT}: {wrong}"
         if after.waits_for_gains:
             after = after._replace(conditions=after.conditions._replace(mode_cause=cause))
-    if mode is not LoopMode.SAFE and uncalibrated(after) and not after.frames_used:
+    if mode is not LoopMode.SAFE and uncalibrated_cause(after) and not after.frames_used:
         mode = LoopMode.IDLE
-    elif (mode is LoopMode.CLOSED and wrong) or (mode is LoopMode.IDLE and not uncalibrated(after)):
+    elif (mode is LoopMode.CLOSED and wrong) or (mode is LoopMode.IDLE and not uncalibrated_cause(after)):
         mode = LoopMode.OPEN
     after = _changed(after, mode, camera.time_ns, cause, events)
     return after, Outputs(events=events, changed=True)
@@ -275,7 +275,7 @@ def _with_camera(state: State, camera: CameraSettings) -> State:
     loop, conditions = state.loop, state.conditions
     if camera != conditions.camera or conditions.camera_awaited:
         state = state._replace(conditions=conditions._replace(camera=camera, camera_awaited=False))
-    if loop is not None and loop.calibration.noll and loop.camera is None and not misfit(state):
+    if loop is not None and loop.calibration.noll and loop.camera is None and not misfit_cause(state):
         state = state._replace(loop=loop._replace(camera=camera))
     return state
 

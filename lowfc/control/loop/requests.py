@@ -15,7 +15,15 @@ from lowfc.control.loop.command_channels import EXTERNAL, FLAT, MIRROR, CommandC
 from lowfc.control.loop.gains import change_integrator, check_offset, offset_remark, per_mode, prepare_gains
 from lowfc.control.loop.inputs import Outputs, PendingEvent, Reply, Request
 from lowfc.control.loop.lease import ENDED_BY, Lease, refusal, request_cause
-from lowfc.control.loop.loading import holding_cause, in_mode, loaded, misfit, mode_events, safe_pending, uncalibrated
+from lowfc.control.loop.loading import (
+    holding_cause,
+    in_mode,
+    loaded,
+    misfit_cause,
+    mode_events,
+    safe_pending,
+    uncalibrated_cause,
+)
 from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, permit, release, renew
 from lowfc.control.loop.safety import MAX_LIMIT_NM, Limits, LoopMode, Rejection, neighbour_difference_nm, request_mode
 from lowfc.control.loop.state import ActiveLoop, LawRunner, Settings, State
@@ -110,13 +118,13 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
             "makes the next, `lowfc ctl load FILE` puts another one in use"
         )
     if after is LoopMode.IDLE:
-        reply = f"loop idle: {uncalibrated(state)}"
+        reply = f"loop idle: {uncalibrated_cause(state)}"
     return in_mode(state, after, request.time_ns, cause), reply
 
 
 def _granted(state: State, name: str) -> LoopMode:
     """The mode after a request; ValueError with the reason if it is refused."""
-    missing = uncalibrated(state)
+    missing = uncalibrated_cause(state)
     after, why = request_mode(state.mode, name, calibrated=not missing)
     if why := why or interlocks.refusal(state.conditions.acting, name):
         raise ValueError(missing if name == "close" and missing else why)
@@ -145,7 +153,7 @@ def _check_closable(state: State) -> None:
 
 
 def _check_camera(state: State) -> None:
-    wrong = misfit(state)
+    wrong = misfit_cause(state)
     if wrong:
         raise ValueError(
             f"the camera does not fit the calibration ({wrong}): set it back, or load a calibration made with it"

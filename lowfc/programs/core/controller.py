@@ -38,7 +38,7 @@ from lowfc.control.durations import Durations
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.command_channels import ADOPTED
 from lowfc.control.loop.inputs import TICK_NS, Input, Load, MirrorReport, Outputs, Reply, Report, Request, Tick
-from lowfc.control.loop.loading import holding_cause, misfit, safe_pending, uncalibrated
+from lowfc.control.loop.loading import holding_cause, misfit_cause, safe_pending, uncalibrated_cause
 from lowfc.control.loop.requests import CONFIGURATION, MAX_REPLY_LENGTH, prepared
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
@@ -350,7 +350,9 @@ class Controller:
             if reply.accepted:
                 continue
             law = request.name == "law"
-            unfit = law and (misfit(self._state) or uncalibrated(self._state))  # the loop stays open or idle
+            unfit = law and (
+                misfit_cause(self._state) or uncalibrated_cause(self._state)
+            )  # the loop stays open or idle
             # Once the controller runs, clients may have changed the loop, so that a refusal is no fault of the file.
             if unfit or (self._mirror_adopted and request.text != ADOPTED):
                 self._service.event("LAW_NOT_IN_FORCE" if law else "FLAT_NOT_IN_FORCE", why=reply.text)
