@@ -60,7 +60,7 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
     halves = np.array_split(np.arange(len(rows)), 2)
     factors, variances = np.zeros(LAGS), np.zeros(LAGS)
     response = np.zeros(len(reference))
-    power = 0.0
+    squared_snr = 0.0
     for estimating, detecting in (halves, halves[::-1]):
         responses, _ = _regressed(rows[estimating], moved[estimating], instruments[estimating])
         left, values, right = np.linalg.svd(responses, full_matrices=False)
@@ -70,8 +70,8 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
         factors += half_factors[:, 0] / 2
         variances += errors[:, 0] ** 2 / 4
         response += direction * noise * abs(left[:, 0].sum()) * values[0] / 2
-        power += float(((half_factors[:, 0] / errors[:, 0]) ** 2).sum())
-    snr = float(np.sqrt(power))
+        squared_snr += float(((half_factors[:, 0] / errors[:, 0]) ** 2).sum())
+    snr = float(np.sqrt(squared_snr))
     if snr < MIN_SNR:
         raise NotSeenError(
             "the pokes are not seen in the frames: is there light on the sensor, does the mirror follow the commands, "

@@ -23,7 +23,7 @@ _FILTER_OMEGA = np.linspace(0, np.pi, _FILTER_POINTS // 2 + 1)
 _FILTER_REACH = 48
 """Frames on either side from which a mean between measurements is interpolated."""
 
-_MOMENTS = 8  # instants of a frame period at which a mean square is sampled
+_INSTANTS = 8  # instants of a frame period at which a mean square is sampled
 
 
 class Timing(NamedTuple):
@@ -117,7 +117,7 @@ def residual_spectrum(law: LinearLaw, omega: Array, measured: Array, noise_nm2: 
 
 
 def commanded(law: LinearLaw, omega: Array, delay: float) -> Complex:
-    """Command (frequencies, modes) from a frame that measures e^(i w t_k), as its multiple; omega in rad per frame."""
+    """Command (frequencies, modes) for a measurement of e^(i w t_k), relative to it; omega in rad per frame."""
     return _commanded(sensitivity(law, omega, delay), omega, delay)
 
 
@@ -185,7 +185,7 @@ def continuous_residual_nm2(
     """
     mean_square = np.zeros_like(disturbance_nm)
     next_nm = np.roll(mirror_nm, -1, axis=0) if next_nm is None else next_nm
-    for moment in ((np.arange(_MOMENTS) + 0.5) / _MOMENTS).tolist():
-        between_nm, _ = means_while_applied(disturbance_nm, Timing(1.0, moment, 0.0, 0.0))
-        mean_square += (between_nm + (mirror_nm if moment < moves_at else next_nm)) ** 2 / _MOMENTS
+    for instant in ((np.arange(_INSTANTS) + 0.5) / _INSTANTS).tolist():
+        between_nm, _ = means_while_applied(disturbance_nm, Timing(1.0, instant, 0.0, 0.0))
+        mean_square += (between_nm + (mirror_nm if instant < moves_at else next_nm)) ** 2 / _INSTANTS
     return mean_square

@@ -14,7 +14,7 @@ MAX_INTERPOLATED_FRAMES = 3
 """Longest gap, in frames, that is interpolated; a longer gap starts a new piece."""
 SHORTEST, LONGEST = 64, 2048
 """Shortest and longest segment of Welch's method, frames; with fewer than the shortest there is no spectrum."""
-_SEGMENT_SHARE = 4  # the longest piece is at least this many segments long, unless a segment would be below `SHORTEST`
+_MIN_SEGMENTS = 4  # the longest piece is at least this many segments long, unless a segment would be below `SHORTEST`
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,7 @@ def spectrum(series: TimeSeries, rate_hz: float, frames: int = 0) -> Spectrum | 
     """
     if series.longest < SHORTEST:
         return None
-    frames = frames or min(LONGEST, max(SHORTEST, 1 << ((series.longest // _SEGMENT_SHARE).bit_length() - 1)))
+    frames = frames or min(LONGEST, max(SHORTEST, 1 << ((series.longest // _MIN_SEGMENTS).bit_length() - 1)))
     window = 0.5 + 0.5 * np.cos(np.linspace(-np.pi, np.pi, frames + 1)[:-1])
     total, segments = np.zeros((series.values[0].shape[1], frames // 2 + 1)), 0
     for piece in series.values:

@@ -65,6 +65,7 @@ class PlayTable(NamedTuple):
     Attributes:
         target: `MIRROR`: a row holds the factors of the shapes in `basis` (columns, actuators), nm of surface; or
             `OFFSET`: a row is added to the loop's target, nm of wavefront of each mode.
+        rows: (frames, columns) numbers of the table.
         largest: (columns,) largest absolute number of each column.
         reach_nm: for `MIRROR`, an upper bound of every actuator's deviation from zero, nm of surface; else 0.
         id: identity of target, rows and basis.
