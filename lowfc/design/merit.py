@@ -30,7 +30,7 @@ CONTROLLED = len(NOLLS_14)
 
 @dataclass(frozen=True)
 class Signal:
-    """Reference image and response of a sensor in one band, on its pixels or on a coarser grid that samples it fully.
+    """I0 and H of a sensor in one band, on its pixels or on a coarser grid that samples the image fully.
 
     Attributes:
         I0: (samples,) image of a flat wavefront, fraction of the open circle's light per pixel.

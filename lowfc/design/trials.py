@@ -44,7 +44,7 @@ def gram(basis: Array) -> Array:
 
 
 def input_rms(gram: Array, bounds: Array) -> float:
-    """Rms over the open pupil of coefficients uniform between minus and plus bounds (modes,), in their unit."""
+    """Rms over the open pupil of wavefronts whose coefficients are uniform within +- bounds (modes,), in their unit."""
     return float(np.sqrt(np.sum(np.diag(gram) * bounds**2) / 3.0))
 
 

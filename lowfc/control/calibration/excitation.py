@@ -78,7 +78,7 @@ def multisine(period_frames: int, bins: list[Integers], rms_nm: float, seed: int
 
 
 def with_lead_in(period: Single, lead_frames: int) -> Single:
-    """A period (frames, modes), with a lead-in of its preceding `lead_frames` frames, in which the loop settles."""
+    """A period (frames, modes) after the `lead_frames` frames before it if it repeats: the loop settles in them."""
     return np.concatenate([period[np.arange(-lead_frames, 0) % len(period)], period])
 
 

@@ -18,7 +18,7 @@ from lowfc.control.laws.spectra import TimeSeries
 FEWEST = 2048
 """Least number of consecutive frames for a fit."""
 
-_LONGEST = 1 << 16  # frames of a segment
+_LONGEST = 1 << 16  # largest number of frames of a segment
 _MAX_LINES = 12
 _SCALES = (3, 9, 27, 81)  # numbers of frequencies over which lines are searched
 _PENALTY = 2.5  # cost of a line in log-likelihood / log(frequencies): 1.5 for its 3 parameters (BIC), 1 for the choice
