@@ -32,7 +32,7 @@ from lowfc.programs.console.app import Console
 from lowfc.programs.console.feed import Reading
 from lowfc.programs.console.gains import Gains
 from lowfc.programs.console.history import History
-from lowfc.programs.console.panels import _PIXELS, _mode, halves, reduced, sparkline
+from lowfc.programs.console.panels import _PIXELS, _mode, half_block_lines, reduced, sparkline
 from lowfc.programs.console.phrases import phrased
 from lowfc.programs.console.task import Task
 from lowfc.programs.view import monitor
@@ -503,7 +503,7 @@ def test_pictures_and_sparklines_have_a_fixed_size() -> None:
         small = reduced(np.full(shape, 4.0))
         assert small.shape == (_PIXELS, _PIXELS)
         assert np.allclose(small, 4.0)
-    lines = halves(np.zeros((4, 3, 3), np.uint8))
+    lines = half_block_lines(np.zeros((4, 3, 3), np.uint8))
     assert [line.plain for line in lines] == ["▀▀▀"] * 2
     for command_nm, limit_nm, bar in ((-5.0, 10.0, "  ██│    "), (np.nan, 10.0, "    │████"), (0.0, 0.0, "    │████")):
         assert _mode(2, command_nm, limit_nm, 12).plain == f"Z2  {bar}"

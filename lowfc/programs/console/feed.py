@@ -25,30 +25,30 @@ from lowfc.programs.view.verdicts.tile import Verdict
 from lowfc.programs.view.verdicts.verdict import judge
 
 DISCONNECTED_S = 1.5
-"""Time without a message after which the console is disconnected: each process sends Health twice a second."""
+"""Time without a message after which the console counts as disconnected; each process sends Health twice a second."""
 TREND_S = 34
 """Span of the sparklines, one column per second."""
 _IMPORT_AFTER_S = 4.0
 """Time after which a thread does the slow imports: the first values do not need them."""
 _PUNCTUAL_S = 0.5
-"""Longest time between two readings for which the values count as up to date."""
+"""Longest time between two readings; after a longer one, the messages received meanwhile count as delayed."""
 _TREND_STEP_NS = 1_000_000_000
 _HIDDEN_REQUESTS = frozenset(("status", "configuration", "renew"))
-"""Periodic requests that change nothing."""
+"""Requests that programs repeat periodically, and that leave the loop unchanged."""
 
 
 class Reading(NamedTuple):
     """Present state of the run.
 
     Attributes:
-        silent_s: age of the newest message; None before the first.
+        silent_s: age of the newest message; None before the first message.
         state: state of the run, from which the verdict is made.
         verdict: verdict, tiles and facts of the view.
-        frame: newest frame; None before the first.
-        command_nm: modal command of the last step, (modes,); empty before the first.
+        frame: newest frame; None before the first frame.
+        command_nm: modal command of the last step, (modes,) nm rms of wavefront; empty before the first step.
         requests: requests received since the previous reading, without `_HIDDEN_REQUESTS`.
         residual_nm: residual, nm rms of wavefront, one value per second; NaN if unknown.
-        light: flux as a fraction of the calibration's, one value per second; NaN if unknown.
+        light: flux as a fraction of the calibration's flux, one value per second; NaN if unknown.
     """
 
     silent_s: float | None

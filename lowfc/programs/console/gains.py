@@ -20,14 +20,14 @@ FINE_BELOW = 0.1
 """Knobs below this gain are turned in fine steps."""
 _BAR = 8  # columns of the bar without its mark
 _BAR_START = 11  # columns before the bar
-_PENDING_S = 1.0  # time for which a knob shows the requested gain, until the controller reports it
+_PENDING_S = 1.0  # time for which a knob shows the requested gain; then it shows the reported one
 
 
 class Gains(Lines):
     """The knobs, scrolled to the chosen one. Keys or a click turn a knob; the gains of its modes keep their ratios."""
 
     def __init__(self, send: Callable[[Sequence[int], Sequence[float]], None]) -> None:
-        """Make the knobs; `send` receives the modes of a knob and their new gains; no gains mean automatic ones."""
+        """Make the knobs; `send` receives the modes of a knob and their new gains; no gains: automatic gains."""
         super().__init__("gains")
         self._send = send
         self._chosen = self._top = 0  # index of the chosen knob, and of the first knob on the screen
@@ -48,13 +48,13 @@ class Gains(Lines):
             self._chosen = min(self._chosen, max(0, len(knobs(noll)) - 1))
         self._draw()
 
-    def choose(self, by: int) -> None:
-        """Choose the knob `by` lines below the present one."""
-        self._chosen = (self._chosen + by) % max(1, len(knobs(self._noll)))
+    def choose(self, lines_down: int) -> None:
+        """Choose the knob `lines_down` lines below the present one; the first one follows the last."""
+        self._chosen = (self._chosen + lines_down) % max(1, len(knobs(self._noll)))
         self._draw()
 
     def turn(self, steps: int) -> None:
-        """Turn the chosen knob."""
+        """Turn the chosen knob by this number of steps, up if positive; the steps of small gains are fine."""
         if self._noll:
             gain = round(self._shown_gain(self._chosen), 3)  # the controller's gains are float32
             fine = gain < FINE_BELOW or (steps < 0 and gain <= FINE_BELOW)
@@ -66,7 +66,7 @@ class Gains(Lines):
             self._send(knobs(self._noll)[self._chosen][1], [])
 
     def discard_pending(self) -> None:
-        """Discard refused requests: the knobs return to the controller's gains."""
+        """Discard the requested gains after a refusal: the knobs return to the controller's gains."""
         self._pending.clear()
 
     def on_click(self, event: events.Click) -> None:
@@ -116,14 +116,14 @@ class Gains(Lines):
 
 def knobs(noll: Sequence[int]) -> list[tuple[str, tuple[int, ...]]]:
     """Name and modes of each knob: all modes, then those of each radial degree."""
-    orders: dict[int, list[int]] = {}
+    by_degree: dict[int, list[int]] = {}
     for mode in noll:
-        orders.setdefault((math.isqrt(8 * mode - 7) - 1) // 2, []).append(mode)
-    named = [(_name(order, modes), tuple(modes)) for order, modes in orders.items()]
+        by_degree.setdefault((math.isqrt(8 * mode - 7) - 1) // 2, []).append(mode)
+    named = [(_name(degree, modes), tuple(modes)) for degree, modes in by_degree.items()]
     return [("gain, all", tuple(noll)), *named] if noll else []
 
 
-def _name(order: int, modes: list[int]) -> str:
-    if order == 1:
+def _name(degree: int, modes: list[int]) -> str:
+    if degree == 1:
         return "tip, tilt"
     return f"Z{modes[0]}" if len(modes) == 1 else f"Z{modes[0]}-{modes[-1]}"

@@ -26,15 +26,15 @@ _PIXELS = 12
 """Rows and columns of a picture; two rows share a line of text."""
 _MODE_LINES = 7
 _SPARKS = "▁▂▃▄▅▆▇█"
-_NEAR_LIMIT = 0.95
+_NEAR_LIMIT = 0.95  # fraction of the modal limit from which a command is drawn in red
 _GAINS = re.compile(r", gain .*?(?=, leak|;)")
 """Part of the law's text that the knobs already show."""
 
 
 @lru_cache(maxsize=4096)
-def style(ink: Colour | None = None, ground: Colour | None = None, *, bold: bool = False) -> Style:
-    """Style of these colours; None means the terminal's own."""
-    red_green_blue = [None if one is None else "#{:02x}{:02x}{:02x}".format(*one) for one in (ink, ground)]
+def style(ink: Colour | None = None, background: Colour | None = None, *, bold: bool = False) -> Style:
+    """Style of a text with these colours; None means the terminal's own."""
+    red_green_blue = [None if one is None else "#{:02x}{:02x}{:02x}".format(*one) for one in (ink, background)]
     return Style(color=red_green_blue[0], bgcolor=red_green_blue[1], bold=bold or None)
 
 
@@ -80,7 +80,7 @@ def pictures(reading: Reading) -> list[Text]:
             shares = (small - lowest) / max(float(np.abs(small - lowest).max()), 1e-9)
             drawn = diverging(shares) if signed else sequential(shares)
             caption = f"mirror ±{largest:.0f} nm" if signed else f"frame to {largest:.0f} DN"
-        for line, text in zip(lines, halves(drawn), strict=True):
+        for line, text in zip(lines, half_block_lines(drawn), strict=True):
             line.append_text(text).append("      ")
         captions.append(f"{caption:18}")
     return [*lines, Text("".join(captions), DIM)]
@@ -96,7 +96,7 @@ def reduced(array: Array) -> Array:
     return array
 
 
-def halves(colours: Rgb) -> list[Text]:
+def half_block_lines(colours: Rgb) -> list[Text]:
     """Lines of text in which each cell shows two pixels of an image (rows, columns, 3), one above the other."""
     lines = []
     for upper, lower in zip(colours[0::2].tolist(), colours[1::2].tolist(), strict=True):
@@ -108,7 +108,7 @@ def halves(colours: Rgb) -> list[Text]:
 
 
 def sparks(reading: Reading) -> list[Text]:
-    """Sparklines of residual and light."""
+    """Sparklines of the residual and the flux, each with its last value."""
     wavefront, flux = reading.state.wavefront, reading.light[-1] if reading.light else float("nan")
     kind = "true" if reading.state.true else "measured"
     residual = "?" if wavefront is None else f"{rounded(wavefront.residual_nm)} nm {kind}"
@@ -128,14 +128,14 @@ def sparkline(values: Sequence[float]) -> str:
 
 
 def modes(reading: Reading, width: int) -> list[Text]:
-    """The command of each mode as a bar between its limits, in columns."""
+    """The command of each mode as a bar between its limits; the modes fill one column after the other."""
     state, noll = reading.state.snapshot.controller, reading.state.snapshot.noll
     if state is None or not noll or len(noll) != len(reading.command_nm):
         return [Text("no calibration, so no modes yet", DIM)]
     columns = -(-len(noll) // _MODE_LINES)
     cell_width = width // columns
     cells = [
-        _mode(mode, float(command), float(limit), cell_width - 2)  # without the middle of the bar and a space
+        _mode(mode, float(command), float(limit), cell_width - 2)  # without the bar's centre and the space after it
         for mode, command, limit in zip(noll, reading.command_nm, state.limit_nm, strict=False)
     ]
     lines = []

@@ -46,11 +46,11 @@ class Task:
             return f"{self.name}: running for {time.monotonic() - self._began_s:.0f} s{f'; {last}' if last else ''}"
         if self.status == 0:
             return f"{self.name}: done; {last}"
-        wrong = next((line for line in reversed(lines) if line.startswith("error:")), last)
-        return f"{self.name} failed: {wrong.removeprefix('error: ')} (full output: {self.output})"
+        error_line = next((line for line in reversed(lines) if line.startswith("error:")), last)
+        return f"{self.name} failed: {error_line.removeprefix('error: ')} (full output: {self.output})"
 
     def _tail(self) -> str:
         try:
             return self.output.read_bytes()[-_TAIL_BYTES:].decode(errors="replace")
-        except OSError:  # the file was removed, such as by a cleaner of temporary files
+        except OSError:  # the file was removed, for example by a cleaner of temporary files
             return ""

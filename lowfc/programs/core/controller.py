@@ -118,8 +118,8 @@ class Controller:
         service.awaited = lambda: "" if self._state.frame_sequence else "a camera"
 
     def run(self) -> None:
-        """Do all work except on frames, which the receiving thread processes; `_lock` serialises the two threads."""
-        self._service.state = "ready"  # from here on the service manager expects beats
+        """Do all work except the steps: the receiving thread makes them, the first one excepted, under `_lock`."""
+        self._service.state = "ready"  # from here on the service manager expects a watchdog signal, which `beat` sends
         self._camera.await_first()
         self._adopt_mirror()
         self._bench.query()
@@ -313,7 +313,7 @@ class Controller:
     def _adopt_mirror(self) -> None:
         """Read the mirror's shape before the first command, so that the mirror does not jump."""
         lockstep = self._service.clock.lockstep
-        if lockstep and self._state.loop is not None:  # every lockstep run starts from flat
+        if lockstep and self._state.loop is not None:  # a lockstep run that has a calibration starts from flat
             self._mirror.close()
             return
         shape = self._mirror.first(MIRROR_PATIENCE_S)
@@ -331,7 +331,7 @@ class Controller:
             self._report_mirror()
 
     def _report_mirror(self) -> None:
-        """Report to the loop that a fault of the mirror began or ended."""
+        """Report the mirror's first shape if it is new, and a fault of the mirror or its end, to the loop."""
         shape = self._mirror.first()
         if shape is not None:  # before the first command: the loop starts from this shape
             self._apply_report(shape)

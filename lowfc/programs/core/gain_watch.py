@@ -204,7 +204,7 @@ class GainWatch:
         return ratio
 
     def _star_changed(self, step: Step, loop: ActiveLoop, ratio: float) -> Actions:
-        """Halve the automatic gains until measured again; if the flux fell below half, lower them by that ratio."""
+        """Halve the automatic gains until measured again; if the flux fell below half, multiply them by its ratio."""
         for group in self._groups:
             group.bank.restart()
         events = (PendingEvent("STAR_CHANGED", {"ratio": ratio}),)
@@ -215,7 +215,7 @@ class GainWatch:
         return Actions((request,), events)
 
     def _judge(self, judged: list[_Group], step: Step, state: State, loop: ActiveLoop) -> Actions:
-        """Requests and events from the newest blocks of frames of these groups."""
+        """Requests and events when a block of frames of these groups is full; a full window gives a verdict."""
         noise_nm2 = self._noise_nm2(loop) if any(group.bank.complete for group in judged) else None
         gain, first_window, events = loop.integrator.gain.copy(), False, []
         for group in judged:
@@ -272,7 +272,7 @@ class GainWatch:
         return None if covariance is None else np.diag(covariance)
 
     def _gain_request(self, step: Step, loop: ActiveLoop, gain: Single) -> Request:
-        """The request for gains (modes,), with the prior of the uncorrected modes for R."""
+        """The request for gains (modes,), with the prior variances of the uncorrected modes for the reconstructor."""
         noise_nm2, uncorrected = self._noise_nm2(loop), loop.automatic & (gain == 0)
         prior_nm2: tuple[float, ...] = ()
         if noise_nm2 is not None and all(group.verdict is not None for group in self._groups):

@@ -79,7 +79,7 @@ class MirrorReports:
         return self._fault if self._reported else "has not reported yet"
 
     def last(self) -> MirrorShape | None:
-        """The shape commanded two Healths before a fault, the newest that the mirror has certainly applied."""
+        """The shape commanded two Healths before a fault was certain, the newest that the mirror has surely applied."""
         return self._commanded[0] if self._commanded else None
 
     def close(self) -> None:

@@ -86,7 +86,7 @@ class StartUp:
     """The configured flat map and control law, requested at the start."""
 
     def __init__(self, config: Configuration) -> None:
-        self._file, self._flat_nm = config.mirror.flat, _checked_flat_nm(config)
+        self._flat_file, self._flat_nm = config.mirror.flat, _checked_flat_nm(config)
         self._law_file, self._law = config.control.law, _configured_law(config)
         _check_gains(config)
 
@@ -120,12 +120,12 @@ class StartUp:
         """
         if request.text == ADOPTED:
             return
-        key, file = ("control.law", self._law_file) if request.name == "law" else ("mirror.flat", self._file)
+        key, file = ("control.law", self._law_file) if request.name == "law" else ("mirror.flat", self._flat_file)
         raise ConfigurationError(f"{key} = {file!r}: {why}")
 
 
 def _adopted_nm(state: State, flat_nm: Single) -> Single | None:
-    """The shape (rows, columns) adopted from the mirror if it contains the flat map; controlled modes are ignored."""
+    """The shape (rows, columns) adopted from the mirror, if it contains the flat map apart from controlled modes."""
     loop = state.loop
     if loop is None or loop.command_channels is None:
         return None

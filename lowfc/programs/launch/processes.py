@@ -14,6 +14,6 @@ def program(name: str, arguments: list[str], stderr_path: Path) -> Child:
 
 
 def stop_all(children: list[Child]) -> None:
-    """Stop all, one after the other, in the order of the list; a recorder has time to write to a slow disk."""
+    """Stop the children one after the other, in the order of the list; a recorder has time to write to a slow disk."""
     for child in children:
         child.stop(60.0 if child.name == Role.RECORDER else 5.0)

@@ -66,7 +66,7 @@ def sim_loop(
         try:
             bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())  # its listener marks the run as starting
         except BusError:
-            if run.links.live():  # another launcher of this name was faster: the directory is that launcher's
+            if run.links.live():  # another launcher of this run was faster: the directory is that launcher's
                 cleanup.pop_all()
             raise
         cleanup.callback(bus.close)
@@ -75,7 +75,7 @@ def sim_loop(
         prepare(config, run, console)
         children += children_of(config, run, duration_s, record)
         if show is not None:
-            children.insert(len(children) - record, _view(run, show, console))  # the recorder, if any, ends last
+            children.insert(len(children) - record, _view(run, show, console))  # the recorder is stopped after it
         for child in children:
             child.start()
         _supervise(config, children, watch, console, duration_s)
@@ -112,7 +112,7 @@ def children_of(config: Configuration, run: Run, duration_s: float | None, recor
     calibration = ["--calibration", str(run.path / "calibration.fits")]
     mirror = mirror_role(config.mirror.name)
     awaited = [Role.CONTROLLER, mirror, *([Role.RECORDER] if record else [])]
-    camera = ["-m", "sim_camera", *common_options, *(word for name in awaited for word in ("--wait-for", str(name)))]
+    camera = ["-m", "sim_camera", *common_options, *(part for name in awaited for part in ("--wait-for", str(name)))]
     if duration_s is not None:
         camera += ["--frames", str(max(1, math.ceil(duration_s * config.camera.rate_hz)))]
     # In lockstep, recording starts before the controller: all logs of one seed start with the same message.

@@ -36,8 +36,8 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     table.add_column(style="dim", justify="right")
     table.add_column()
     silent = _silence_notice(watch)
-    live = f"{hertz(camera.rate_hz)} of {config.camera.rate_hz:g} Hz"
-    rate = silent or _rate(live, camera.rate_hz, config.lockstep_hz)
+    measured = f"{hertz(camera.rate_hz)} of {config.camera.rate_hz:g} Hz"
+    rate = silent or _rate(measured, camera.rate_hz, config.lockstep_hz)
     table.add_row("loop", Text(f"{mode(controller)}, {rate}"))  # rich would read a string as markup
     table.add_row("wavefront", silent or _wavefront_in_words(camera))
     table.add_row("frame to command", latency(controller.frame_to_command))
@@ -73,14 +73,14 @@ def status_line(watch: Watch, elapsed_s: float, lockstep_hz: float | None = None
     )
 
 
-def _rate(live: str, rate_hz: float, lockstep_hz: float | None) -> str:
-    """Text of the frame rate: `live`, or in lockstep the rate in simulated time and the speed of the computation."""
+def _rate(measured: str, rate_hz: float, lockstep_hz: float | None) -> str:
+    """Text of the frame rate: `measured`, or in lockstep the rate in simulated time and the speed of computation."""
     computed = f", computed at {rate_hz:.4g} frames per second" if rate_hz else ""
-    return live if lockstep_hz is None else f"{lockstep_hz:g} Hz in simulated time{computed}"
+    return measured if lockstep_hz is None else f"{lockstep_hz:g} Hz in simulated time{computed}"
 
 
 def _closed_for(controller: wire.Health, rate_hz: float) -> str:
-    """Text of how long the loop was closed in total; empty unless shorter than the span of the residual statistics."""
+    """Text of the total time closed, if the loop is closed and this time is shorter than `_RECENT_S`; else empty."""
     frames = topic_count(controller, FRAME.key).received
     closed_s = frames / rate_hz - controller.not_closed_ns * 1e-9 if rate_hz else 0.0
     just_closed = controller.mode == wire.LOOP_MODE_CLOSED and 0 < closed_s < _RECENT_S
@@ -153,11 +153,12 @@ def _contrast_lines(results: dict[str, Any]) -> list[str]:
     added = results["added_contrast"]
     if added is None:
         return []
-    own = "" if results["dark_zone_contrast"] is None else f"coronagraph alone {results['dark_zone_contrast']:.1e}; "
+    own = results["dark_zone_contrast"]
+    coronagraph = "" if own is None else f"coronagraph alone {own:.1e}; "
     beyond = ("residual",) if results["beyond_quadratic"] else ()
-    how = QUADRATIC if results["beyond_quadratic"] is None else "; computed from full images of the true wavefront"
-    most = None if beyond else costliest_modes(results)  # the share is of the quadratic form
-    return [f"contrast           {own}{contrast_in_words(contrast_cases(added), most, beyond, how)}"]
+    method = QUADRATIC if results["beyond_quadratic"] is None else "; computed from full images of the true wavefront"
+    costliest = None if beyond else costliest_modes(results)  # the share is of the quadratic form
+    return [f"contrast           {coronagraph}{contrast_in_words(contrast_cases(added), costliest, beyond, method)}"]
 
 
 def _wavefront_lines(results: dict[str, Any]) -> list[str]:
@@ -176,7 +177,7 @@ def _wavefront_lines(results: dict[str, Any]) -> list[str]:
 
 
 def summary_text(results: dict[str, Any], lockstep_hz: float | None = None) -> str:
-    """The summary of a run as text; `lockstep_hz` as in `summary`."""
+    """The summary of a run as text; `lockstep_hz` is the frame rate in simulated time, None without lockstep."""
     command, mirror = (results["latency_us"][name] for name in ("frame_to_command", "frame_to_mirror"))
 
     def percentiles(values: dict[str, float], count: int) -> str:
@@ -185,10 +186,10 @@ def summary_text(results: dict[str, Any], lockstep_hz: float | None = None) -> s
         shown = {name: value for name, value in values.items() if count >= _MIN_DURATIONS.get(name, 1)}
         return "   ".join(f"{name.replace('_', '.')} {value:.0f} us" for name, value in shown.items())
 
-    live = f"{results['rate_hz']:.1f} Hz" if results["rate_hz"] else "-"
+    measured = f"{results['rate_hz']:.1f} Hz" if results["rate_hz"] else "-"
     lines = [
         f"loop               {_loop_in_words(results)}",
-        f"rate               {_rate(live, results['rate_hz'], lockstep_hz)}",
+        f"rate               {_rate(measured, results['rate_hz'], lockstep_hz)}",
         f"frames             {results['frames_published']} published, {results['frames_processed']} processed, "
         f"{results['frames_skipped']} skipped, {results['frames_missing']} missing",
         f"commands           {results['commands_applied']} applied, {results['commands_late']} after the start of the "

@@ -2,8 +2,8 @@
 
 The recorder runs it, because a run has at most one recorder, which receives every event and is not in the loop; a
 console may be closed, or open twice. The command is started by a thread without real-time priority, and so has none
-either. Events during the command, and for `recorder.on_event_every_s` after it, wait; then, or when the recorder ends,
-the command is run once, for the most severe of them.
+either. Events that arrive while the command runs, or within `recorder.on_event_every_s` after it, wait. Then, or when
+the recorder ends, the command is run once for them, with the most severe event.
 """
 
 import contextlib

@@ -39,7 +39,7 @@ class Peers:
         return all(state == "stopped" for name, (_, state) in self._states.items() if name != except_name)
 
     def store(self, sample: Sample) -> bool:
-        """Store a calibration or state unless a newer one is known; return whether it is new."""
+        """Store a calibration or state unless the same or a newer one is known; return whether it was stored."""
         kept = self.newest.get(sample.key)
         newer = kept is None or (kept.publish_time_ns, kept.sequence) < (sample.publish_time_ns, sample.sequence)
         if newer:

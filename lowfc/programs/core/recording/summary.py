@@ -14,7 +14,7 @@ class Summary:
         messages: number of messages recorded.
         lost: number of messages lost, by topic.
         failure: reason why the recording ended early; empty if it did not.
-        longest_wait_ns: longest time from the arrival of a message, once there was a log, until it was written.
+        longest_wait_ns: longest time from the arrival of a message until it was written, once a log was open.
         longest_unflushed_ns: longest time from the arrival of a message until a kill -9 of the recorder could no longer
             lose it.
         longest_write_ns: longest single write to the disk.
