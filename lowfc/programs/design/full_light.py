@@ -1,4 +1,4 @@
-"""`lowfc design zwfs` and `lowfc design clowfs`: optimisation of one dimension of a sensor without a relay mask."""
+"""`lowfc design zwfs` and `lowfc design clowfs`: optimisation of the size of a sensor without a relay mask."""
 
 from functools import cache
 from pathlib import Path
@@ -18,7 +18,7 @@ from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.design.full_light_request import Sizes
 
 KEYS = {"zwfs": "spot_diameter", "clowfs": "defocus_mm"}
-_POINTS = 21
+_POINTS = 21  # sizes at which a sensor is evaluated before the optimisation
 
 
 class Point(Result):
@@ -48,7 +48,7 @@ class Sweep(Result):
 
 
 def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Sweep:
-    """Evaluate sizes of a sensor, optimise between them, and write the keys of the best as a configuration."""
+    """Evaluate a sensor at several sizes, optimise between them, and write the keys of the best as a configuration."""
     if plot is not None:
         figure_class()  # report a missing package before the work, not after
     require_folder(out, plot)

@@ -32,8 +32,8 @@ from lowfc.programs.design.sam_request import Search
 STATE_PERIOD_S = 10.0
 """Shortest time between two writes of the state file."""
 _PUPIL_SAMPLES = 256
-"""One sample per cell of the package's shaped pupil. Predictions agree with those at 512 samples to a relative 4e-4,
-predictions of contrast to 2 %."""
+"""Samples across the pupil: one for each cell of the package's shaped pupil. Predictions differ from those with 512
+samples by at most 4e-4 (relative), predictions of contrast by at most 2 %."""
 _NOTHING = "no chain had finished its first steps: nothing was found, nothing is written"
 
 
@@ -62,8 +62,8 @@ def design_sam(
     _one_thread()
     if plot_file is not None:
         figure_class()  # report a missing package before the work, not after
-    pupil = pupil_digest()
-    write_state(state, search, pupil, chains)  # fails here, before the work, if the folder cannot be written
+    digest = pupil_digest()
+    write_state(state, search, digest, chains)  # fails here, before the work, if the folder cannot be written
     interrupted = False
     with counting_bar(console, TimeElapsedColumn(), TimeRemainingColumn()) as count:
         saved_s = time.monotonic()
@@ -74,18 +74,18 @@ def design_sam(
             best, done = min(chain.best_merit for chain in chains), sum(chain.step for chain in chains)
             count(f"{search.goal.merit} {best:.4g}", done, search.chains * search.steps)
             if time.monotonic() - saved_s > STATE_PERIOD_S:
-                write_state(state, search, pupil, chains)
+                write_state(state, search, digest, chains)
                 saved_s = time.monotonic()
 
         try:
             run_chains(search, chains, executor, on_block)
         except KeyboardInterrupt:
             interrupted = True
-            if _store_or_remove(state, search, pupil, chains, out) == _NOTHING:
+            if _store_or_remove(state, search, digest, chains, out) == _NOTHING:
                 console.print(_NOTHING, highlight=False)
                 raise
         except Exception as error:
-            advice = _store_or_remove(state, search, pupil, chains, out)
+            advice = _store_or_remove(state, search, digest, chains, out)
             if is_lost(error):
                 raise LowfcError(f"the workers were lost ({error!r}); {advice}") from error
             raise
@@ -112,30 +112,30 @@ def design_sam(
     }
 
 
-def _store_or_remove(state: Path, search: Search, pupil: str, chains: list[Chain], out: Path) -> str:
+def _store_or_remove(state: Path, search: Search, digest: str, chains: list[Chain], out: Path) -> str:
     """Write the state if any chain has advanced, otherwise remove it; return what to do next."""
     if not any(chain.step for chain in chains):
         state.unlink(missing_ok=True)
         return _NOTHING
-    write_state(state, search, pupil, chains)
+    write_state(state, search, digest, chains)
     return f"continue with --resume {state} --out {out}"
 
 
 def run_chains(search: Search, chains: list[Chain], executor: Executor, on_block: Callable[[], None]) -> None:
-    """Advance every chain to its end, in place, block by block; call `on_block` after each block."""
+    """Advance every chain to its end, in place, in blocks of steps; call `on_block` after each block."""
     running: dict[Future[Chain], int] = {}
-    pupil = pupil_digest()
+    digest = pupil_digest()
     try:
         for i, chain in enumerate(chains):
             if chain.step < chain.steps:
-                running[executor.submit(advance_block, search, chain, pupil)] = i
+                running[executor.submit(advance_block, search, chain, digest)] = i
         while running:
             done, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
                 i = running.pop(future)
                 chains[i] = future.result()
                 if chains[i].step < chains[i].steps:
-                    running[executor.submit(advance_block, search, chains[i], pupil)] = i
+                    running[executor.submit(advance_block, search, chains[i], digest)] = i
             on_block()
     finally:
         for future, i in running.items():
@@ -143,9 +143,9 @@ def run_chains(search: Search, chains: list[Chain], executor: Executor, on_block
                 chains[i] = future.result()
 
 
-def advance_block(search: Search, chain: Chain, pupil: str) -> Chain:
-    """Advance a chain by one block; called in a worker, possibly on another machine."""
-    if pupil != pupil_digest():
+def advance_block(search: Search, chain: Chain, digest: str) -> Chain:
+    """Advance a chain by one block of steps; called in a worker, possibly on another machine."""
+    if digest != pupil_digest():
         raise ConfigurationError("a worker has another shaped pupil: install the same lowfc on all machines")
     _one_thread()
     return advance(_optics(search.focal_masks), search.goal_of(chain.index), search.bounds, chain)
@@ -233,7 +233,7 @@ def _predictions(focal_mask: str, holes_: tuple[Hole, ...]) -> dict[str, Any]:
 
 
 def _described(holes_: Sequence[Hole]) -> str:
-    """Number and diameters of holes, in per cent of the pupil's diameter."""
+    """Number of holes, and their diameters in per cent of the pupil's diameter."""
     low, high = min(hole[2] for hole in holes_), max(hole[2] for hole in holes_)
     size = f"{low:.1%}" if low == high else f"{low:.1%} to {high:.1%}"
     return f"{counted(len(holes_), 'hole')} of {size.replace('.0%', '%')}"

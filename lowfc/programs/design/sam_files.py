@@ -42,7 +42,8 @@ def check_files(out: Path, resume: Path | None, *others: Path | None) -> Path:
         others: Other files to be written.
 
     Raises:
-        ConfigurationError, DataFileError: A file cannot be written, or holds the state of an interrupted search.
+        ConfigurationError, DataFileError: A file cannot be written, `out` does not end in .json, or a new search would
+            overwrite the state of an interrupted one.
     """
     if out.suffix != ".json":
         raise ConfigurationError(f"--out must end in .json, the only type read as a layout file; got {out}")
@@ -54,32 +55,32 @@ def check_files(out: Path, resume: Path | None, *others: Path | None) -> Path:
     return state
 
 
-def write_state(path: Path, search: Search, pupil: str, chains: Sequence[Chain]) -> None:
-    """Write the state from which a search can be resumed."""
-    state = {"search": asdict(search), "pupil": pupil, "chains": [asdict(chain) for chain in chains]}
+def write_state(path: Path, search: Search, digest: str, chains: Sequence[Chain]) -> None:
+    """Write the state from which a search can be resumed, with the digest of its pupil."""
+    state = {"search": asdict(search), "pupil": digest, "chains": [asdict(chain) for chain in chains]}
     write_whole(path, json.dumps(state).encode())
 
 
-def read_state(path: Path, pupil: str) -> tuple[Search, list[Chain]]:
-    """Read the search and chains of a state file; DataFileError if it is not one, or belongs to another pupil."""
+def read_state(path: Path, digest: str) -> tuple[Search, list[Chain]]:
+    """Read the search and chains of a state file; DataFileError if it has none, or the digest of another pupil."""
     try:
         state = json.loads(input_file.read_whole(path, _MAX_BYTES))
         search = Search(**state["search"])
         chains = [Chain(**{key: _as_tuple(value) for key, value in chain.items()}) for chain in state["chains"]]
-        pupil_searched = state["pupil"]
+        searched_digest = state["pupil"]
         if len(chains) != search.chains:
             raise ValueError(f"{len(chains)} chains, expected {search.chains}")
     except FileNotFoundError:
         raise DataFileError(f"there is no search to resume in {path}") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DataFileError(f"{path} is not the state of a search: {type(error).__name__}: {error}") from error
-    if pupil_searched != pupil:
+    if searched_digest != digest:
         raise DataFileError(f"{path} belongs to a search with another shaped pupil; start a new one without --resume")
     return search, chains
 
 
 def write_layouts(path: Path, points: Sequence[FoundLayout], search: Search, command: str) -> None:
-    """Write layouts in the format that the loop reads, each with the command that found it."""
+    """Write layouts in the format that the loop reads, each with the command of the search."""
     entries = {point.layout.name: _entry(point, search, command) for point in points}
     content = json.dumps({"units": UNITS, "layouts": entries}, indent=1) + "\n"
     for name, entry in json.loads(content)["layouts"].items():
@@ -88,7 +89,7 @@ def write_layouts(path: Path, points: Sequence[FoundLayout], search: Search, com
 
 
 def write_front(path: Path, points: Sequence[FoundLayout]) -> None:
-    """Write a table of the points (CSV); points on the front are marked."""
+    """Write a table of the layouts (CSV); those on the front are marked."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["layout", "holes", "table3_waves", "table4_mas", "throughput", "merit", "on_front"])
@@ -100,7 +101,7 @@ def write_front(path: Path, points: Sequence[FoundLayout]) -> None:
 
 
 def write_plot(path: Path, points: Sequence[FoundLayout], search: Search) -> None:
-    """Plot Table 4 against Table 3 for the points and the paper (PNG)."""
+    """Plot the prediction for Table 4 against that for Table 3, for the layouts and the paper's sensor (PNG)."""
     figure = figure_class()(figsize=(6.4, 4.8), layout="constrained")
     axes = figure.subplots()
     on_front = sorted(front(points), key=lambda point: point.table3_waves)
@@ -115,7 +116,7 @@ def write_plot(path: Path, points: Sequence[FoundLayout], search: Search) -> Non
 
 
 def front(points: Sequence[FoundLayout]) -> list[FoundLayout]:
-    """The Pareto front: all points but those that another point beats in one table and at least equals in the other."""
+    """The Pareto front: all layouts that no other layout beats in one table and at least equals in the other."""
     return [
         point
         for point in points
