@@ -450,7 +450,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_several_processes_give_the_same_account_as_one_process(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chunk_ends_ns = workers._chunk_ends_ns  # unsorted, as after a calibration recorded again with its old time
     monkeypatch.setattr(workers, "_chunk_ends_ns", lambda path: chunk_ends_ns(path)[::-1])
-    monkeypatch.setattr(workers, "_WORTH_BYTES", 1)
+    monkeypatch.setattr(workers, "_MIN_SEGMENT_BYTES", 1)
     by_one, by_two = (workers.replay_files([log], 0.0, jobs, lambda done: None) for jobs in (1, 2))
     assert (by_one.identical, by_one.log_s) == (True, pytest.approx((STEPS - 1) / 1000))
     assert by_one == by_two

@@ -298,7 +298,7 @@ def test_another_reconstructor_is_weighted_like_the_logged_one(
     np.testing.assert_array_equal(run.measured_again(run.calibration), expected)
     for change, warned in (("estimator=pinv", True), ("gain=0.3", True), ("gain=0,tilt_gain=0.2", False)):
         warnings = " ".join(results_of(run, requested_changes(change))["warnings"])
-        assert ("weighted the logged reconstructor for modes that they do not correct (focus)" in warnings) == warned
+        assert ("a prior of the modes that automatic gains did not correct (focus)" in warnings) == warned
 
 
 def test_used_frames_that_the_log_lacks_are_counted(

@@ -14,10 +14,10 @@ AOT describes a telescope with a Shack-Hartmann or pyramid sensor. A log is mapp
     ControlLoop         one row for each step, in the log's order
       time                end of the exposure, and frame count
       modal_coefficients  measured modal error, nm rms of wavefront; NaN if the frame was refused
-      commands            commanded surface at each actuator, m; NaN if the log has no command for this frame
+      commands            surface at each actuator in the frame's first command, m; NaN if the log has none
       modes               Zernike polynomials of the calibration's modes, over the unit circle
-      measurements_to_modes, modes_to_measurements, modes_to_commands: R (as at the end of the log, weighted by
-                          automatic gains), H and MODES2ACT
+      measurements_to_modes, modes_to_measurements, modes_to_commands: R (in use at the end of the log, with the
+                          prior set by automatic gains), H and MODES2ACT
       time_filter_num, _den: the integrator g / (z - (1 - leak)) of each mode, at the end of the log
       delay               from mid-exposure to the middle of the command's period, in frames: delay_frames +
                           (1 - exposure / period) / 2
@@ -55,7 +55,7 @@ from lowfc.programs.logs.export.cubes import copy_frames_to_fits, fits_cube
 
 _COMMANDS = "COMMANDS"
 _FRAMES = "FRAMES"
-_MODES_PIXELS = 64  # on each side of a mode's image
+_MODES_PIXELS = 64  # rows and columns of a mode's image
 _NM = 1e-9
 
 
@@ -66,11 +66,11 @@ def write_aot(files: list[Path], history: History, *, with_frames: bool) -> None
     if history.calibration is None:
         raise DataFileError(f"{history.log.path} has no calibration, which AOT requires")
     system = _System(history, history.calibration, with_frames=with_frames).system
-    units = AOTFITSWriter(system).get_hdulist()
-    units.writeto(path, overwrite=True)
+    hdus = AOTFITSWriter(system).get_hdulist()
+    hdus.writeto(path, overwrite=True)
     AOTFITSReader(path, exception_level=AOTFITSErrorLevel.WARNING)
-    empty_images = {unit.name: unit for unit in units if unit.name in (_COMMANDS, _FRAMES)}
-    fits.HDUList([unit for unit in units if unit.name not in empty_images]).writeto(path, overwrite=True)
+    empty_images = {hdu.name: hdu for hdu in hdus if hdu.name in (_COMMANDS, _FRAMES)}
+    fits.HDUList([hdu for hdu in hdus if hdu.name not in empty_images]).writeto(path, overwrite=True)
     if _COMMANDS in empty_images:
         _copy_commands(path, empty_images[_COMMANDS], history, history.calibration)
     if _FRAMES in empty_images:
@@ -230,7 +230,7 @@ def _copy_commands(path: Path, image: fits.ImageHDU, history: History, calibrati
             continue
         surface_nm = actuators(command)
         if surface_nm is not None and surface_nm.size == shape[1]:  # another size is another mirror's
-            row = row_of.pop(command.frame_sequence, None)  # later commands of this frame only repeat the first
+            row = row_of.pop(command.frame_sequence, None)  # later ones repeat it, or step to flat without frames
             if row is not None:
                 rows[row] = surface_nm.ravel() * np.float32(_NM)
 

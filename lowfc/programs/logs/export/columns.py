@@ -42,8 +42,8 @@ class Column:
 def step_columns(history: History) -> list[Column]:
     """All quantities of a run's steps, one row for each step in the order of recording.
 
-    Truth, durations and mirror are joined by frame sequence; NaN where the log does not have them. Error and flux of a
-    refused frame are NaN.
+    Truth, durations and mirror stroke are joined by frame sequence; NaN where the log does not have them. Error and
+    flux of a refused frame are NaN.
     """
     steps = history.steps
     if not steps.sequence.size:
@@ -53,7 +53,7 @@ def step_columns(history: History) -> list[Column]:
         fitting = f" that fit its calibration ({excluded} do not)" if excluded else ""
         raise DataFileError(f"{path} has no steps{fitting}: there is nothing to export")
 
-    used, missing = np.isfinite(steps.error_nm).all(axis=1), np.float32(np.nan)
+    measured, missing = np.isfinite(steps.error_nm).all(axis=1), np.float32(np.nan)
 
     def reasons(bits: int) -> str:
         return " ".join(reason.name.lower() for reason in REASONS if bits >> reason & 1)
@@ -65,7 +65,7 @@ def step_columns(history: History) -> list[Column]:
         Column("time_utc", steps.time_ns.astype("datetime64[ns]"), "", "time_ns as a date"),
         Column("mode", _named(steps.mode, mode_name), "", "loop mode"),
         Column("reasons", _named(steps.reasons, reasons), "", "reason why the frame was refused, or limits that acted"),
-        Column("flux_dn", np.where(used, steps.flux_dn, missing), "adu", "sum of the good pixels, dark subtracted"),
+        Column("flux_dn", np.where(measured, steps.flux_dn, missing), "adu", "sum of the good pixels, dark subtracted"),
         Column(
             "saturated_pixels", steps.saturated_pixels, "pix", "good pixels at full well; 0 if the frame was refused"
         ),

@@ -42,7 +42,7 @@ def fits_cube(path: Path, image: "fits.ImageHDU", shape: tuple[int, ...]) -> npt
 
 
 def copy_frames_to_fits(path: Path, image: "fits.ImageHDU", history: History) -> Columns:
-    """Copy the frames of a run into a new extension with the header of `image`; DataFileError as in `_frames`.
+    """Copy the frames of a run into a new extension with the header of `image`; DataFileError if one is unreadable.
 
     Returns:
         `sequence` and `time_ns` of each frame in the order of recording.
@@ -60,7 +60,7 @@ def copy_frames_to_fits(path: Path, image: "fits.ImageHDU", history: History) ->
 
 
 def copy_frames_to_npy(path: Path, history: History) -> None:
-    """Copy the frames of a run into a .npy file for `numpy.load(..., mmap_mode="r")`; DataFileError as in `_frames`."""
+    """Copy the frames of a run into a .npy file that numpy can map; DataFileError if one is unreadable."""
     with path.open("wb") as stream:
         for _, pixels in _frames(history):
             if not stream.tell():

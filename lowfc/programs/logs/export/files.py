@@ -40,8 +40,8 @@ def write_csv(files: list[Path], history: History) -> None:
 def write_npz(files: list[Path], history: History) -> None:
     """Write the arrays of the steps and the calibration, without pickling; the name of an array ends in its unit.
 
-    Frames (frames, rows, columns) in DN go to the second of `files`, if given: a .npy in the order of `frame_sequence`,
-    which `numpy.load` maps with `mmap_mode="r"`.
+    Frames (frames, rows, columns) in DN go to the second of `files`, if given: a .npy file in the order of
+    `frame_sequence`, which `numpy.load` maps with `mmap_mode="r"`.
     """
     arrays = {column.name: column.values for column in step_columns(history)}
     arrays["frame_sequence"] = history.frame_sequence
@@ -65,23 +65,23 @@ def write_npz(files: list[Path], history: History) -> None:
 def write_fits(files: list[Path], history: History, *, with_frames: bool) -> None:
     """Write the steps as table STEPS, each array of the calibration as an image, frames as FRAMES and FRAME_TIMES."""
     arrays = calibration_columns(history.calibration) if history.calibration is not None else ()
-    units = [
+    hdus = [
         _primary(history),
         _table("STEPS", step_columns(history)),
         *(extension(one.name, one.values, one.description, one.unit or None) for one in arrays),
     ]
-    fits.HDUList(units).writeto(files[0], overwrite=True, checksum=True)
+    fits.HDUList(hdus).writeto(files[0], overwrite=True, checksum=True)
     if not with_frames:
         return
     cube = fits.ImageHDU(np.zeros((1, 1, 1), np.float32), name="FRAMES")
     cube.header["BUNIT"] = "adu"
     copied = copy_frames_to_fits(files[0], cube, history)
-    identity = [
+    frame_times = [
         Column("sequence", copied.values("sequence"), "", "frame sequence"),
         Column("time_ns", copied.values("time_ns"), "ns", "end of the exposure, since 1970-01-01 UTC"),
     ]
     with fits.open(files[0], mode="append") as file:
-        file.append(_table("FRAME_TIMES", identity))
+        file.append(_table("FRAME_TIMES", frame_times))
 
 
 def _cells(values: npt.NDArray[Any]) -> npt.NDArray[np.str_]:
@@ -118,8 +118,8 @@ def _table(name: str, columns: list[Column]) -> fits.BinTableHDU:
         elif values.dtype == np.uint64:
             values = values.astype(np.int64)  # FITS has no uint64; a start in seconds << 32 fits in int64 until 2038
         rows[column.name] = TableColumn(values, unit=column.unit or None)
-    unit = fits.table_to_hdu(rows)
-    unit.name = name
+    hdu = fits.table_to_hdu(rows)
+    hdu.name = name
     for number, column in enumerate(columns, 1):
-        unit.header.set(f"TCOMM{number}", column.description)
-    return unit
+        hdu.header.set(f"TCOMM{number}", column.description)
+    return hdu

@@ -1,7 +1,7 @@
 """Choice of the keys of a log to republish, and of the roles to republish them in.
 
-Each topic of a log was published by a role of the loop. `lowfc publish` takes over these roles, including their ports,
-so that each role belongs either to the log or to a live process, never to both.
+The camera, the controller and the mirrors published most topics of a log. `lowfc publish` takes over these roles,
+including their ports, so that each role belongs either to the log or to a live process, never to both.
 """
 
 from collections.abc import Collection, Sequence

@@ -75,7 +75,7 @@ class Account(Result):
     @computed_field  # type: ignore[prop-decorator]
     @property
     def identical(self) -> bool:
-        """Whether steps and commands were checked with the log's own kernel, and none differed beyond the tolerance."""
+        """Whether steps and commands were checked with the log's kernel, and no message differs beyond tolerance."""
         same = not self.different and not self.other_kernel
         return self.frames > 0 and same and (self.commands > 0 or not self.commands_missing)
 

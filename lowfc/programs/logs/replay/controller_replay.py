@@ -95,7 +95,7 @@ class ControllerReplay:
         self.done = begun_ns >= context.segment.until_ns
         self.retry_pending = False
         self._context, self._account = context, context.account
-        self._end: int | None = None  # input number of the first state of the next segment
+        self._end_number: int | None = None  # input number of the first state of the next segment
         self._lost_number: int | None = None  # input number at which the state was lost
         self._dropped = 0  # number of inputs dropped since then
         self._start_number = 0  # input number of the adopted state
@@ -118,7 +118,7 @@ class ControllerReplay:
         if isinstance(body, wire.ControllerState):
             self._add_state(body, message.receive_time_ns)
         else:
-            number: int = body.input_number  # type: ignore[attr-defined]  # all kinds but states have it
+            number: int = body.input_number  # type: ignore[attr-defined]  # every kind has it
             if not number:  # an unreadable request, or a command of another program
                 if kind is wire.ControlStep:
                     raise DataFileError(
@@ -192,7 +192,8 @@ class ControllerReplay:
         if receive_time_ns < self._context.segment.from_ns:
             return
         if receive_time_ns >= self._context.segment.until_ns:
-            self._end = message.input_number if self._end is None else min(self._end, message.input_number)
+            number = message.input_number
+            self._end_number = number if self._end_number is None else min(self._end_number, number)
         past = next((state for state in self._recent_states if state.input_number == message.input_number), None)
         if past is not None:
             self._compare_state(past, message)
@@ -201,7 +202,7 @@ class ControllerReplay:
             self.retry_pending = True
 
     def _adopt(self) -> bool:
-        """Continue from the earliest complete state whose calibration is known; False without one, or at the end."""
+        """Continue from the first complete state of known calibration; False without one, or at the segment's end."""
         if not self.retry_pending:
             return False
         self.retry_pending = False
@@ -221,7 +222,7 @@ class ControllerReplay:
             if self._lost_number is not None:
                 self._account.inputs_missing += number - self._lost_number - self._dropped
                 self._lost_number = None
-            self.done = number == self._end
+            self.done = number == self._end_number
             return not self.done
         return False
 
@@ -237,8 +238,8 @@ class ControllerReplay:
             self._account.other_kernel = found.name
         return found._replace(name=name)
 
-    def _drop_entries(self, upto: int) -> None:
-        for number in [number for number in self._entries if number <= upto]:
+    def _drop_entries(self, last_number: int) -> None:
+        for number in [number for number in self._entries if number <= last_number]:
             logged = self._entries.pop(number).logged
             self._dropped += logged is not None
             if self._unchecked_because:  # otherwise the step belongs to another segment
@@ -275,8 +276,8 @@ class ControllerReplay:
                 return frame
             case wire.Request() as request:
                 with contextlib.suppress(ValueError):
-                    time_ns, found = from_timestamp(request.timestamp), self._context.published
-                    decoded = codec.request(request, request.name, time_ns, found.calibrations, found.laws, found.plays)
+                    time_ns, known = from_timestamp(request.timestamp), self._context.published
+                    decoded = codec.request(request, request.name, time_ns, known.calibrations, known.laws, known.plays)
                     if self._context.former is not None and not request.accepted:  # this version might accept it
                         decoded = replace(decoded, refusal=request.reply or "refused in the log")
                     return prepared(self._settings, decoded)
@@ -303,7 +304,7 @@ class ControllerReplay:
         self._account.requests += isinstance(input_, Request)
         self._state = state
         self._recent_states.append(state)
-        self.done = state.input_number == self._end
+        self.done = state.input_number == self._end_number
 
     def _difference(self, state: State, logged: Message, replayed: Message | None) -> Difference | None:
         """Difference between a logged and a replayed message in the compared fields; None if these are equal."""
@@ -357,7 +358,7 @@ class ControllerReplay:
 
     def _compare_state(self, state: State, logged: wire.ControllerState) -> None:
         self._account.states += 1
-        self.done = state.input_number == self._end
+        self.done = state.input_number == self._end_number
         replayed = controller_state(state, self._settings, from_timestamp(logged.timestamp))
         found = self._difference(state, logged, replayed)
         if found is None:

@@ -27,7 +27,7 @@ class Replay:
     """Replay of a log, or of consecutive logs, message by message."""
 
     def __init__(self, tolerance_nm: float = 0.0, segment: Segment = WHOLE, kernel: str = "") -> None:
-        """Replay a segment of the log; see `Context` for the other arguments."""
+        """Replay a segment of the log; tolerance and kernel are those of `Context`."""
         self.context = Context(tolerance_nm, segment, kernel=kernel)
         self._controllers: dict[int, ControllerReplay] = {}
         self._recording = "", ""

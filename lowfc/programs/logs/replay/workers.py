@@ -25,8 +25,8 @@ from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, WHOLE, Seg
 from lowfc.programs.logs.replay.fold import TOPICS, Replay
 from lowfc.programs.logs.replay.former import FormerVersion
 
-_WORTH_BYTES = 50_000_000
-"""Size of log that justifies another process; for a smaller log, starting the process takes longer than it saves."""
+_MIN_SEGMENT_BYTES = 50_000_000
+"""Smallest size of a segment; starting a process for a smaller one would take longer than it saves."""
 _SEGMENTS_PER_JOB = 4  # for steady progress, and short idle times at the end
 _PROGRESS_EVERY = 5000  # messages
 
@@ -49,19 +49,20 @@ def replay_files(
         _refuse_disorder(paths, chunk_ends_ns)
     size = sum(path.stat().st_size for path in paths)
     jobs = jobs or len(os.sched_getaffinity(0))
-    count = min(_SEGMENTS_PER_JOB * jobs, size // _WORTH_BYTES) if ends_ns and jobs > 1 else 1
-    if count < 2:
+    segment_count = min(_SEGMENTS_PER_JOB * jobs, size // _MIN_SEGMENT_BYTES) if ends_ns and jobs > 1 else 1
+    if segment_count < 2:
         accounts = [_replay_segment(paths, tolerance_nm, kernel, WHOLE, progress)]
     else:
-        edges = [0, *(ends_ns[len(ends_ns) * segment // count] for segment in range(1, count)), WHOLE.until_ns]
-        segments = [Segment(from_ns, until_ns) for from_ns, until_ns in pairwise(edges)]
+        inner_ns = (ends_ns[len(ends_ns) * number // segment_count] for number in range(1, segment_count))
+        edges_ns = [0, *inner_ns, WHOLE.until_ns]
+        segments = [Segment(from_ns, until_ns) for from_ns, until_ns in pairwise(edges_ns)]
         accounts = []
         with interrupt_blocked():  # only the parent handles Ctrl-C; it ends its workers
-            workers = multiprocessing.get_context("spawn").Pool(min(jobs, count))
+            workers = multiprocessing.get_context("spawn").Pool(min(jobs, segment_count))
         with workers as pool:
             for account in pool.imap(partial(_replay_segment, paths, tolerance_nm, kernel), segments):
                 accounts.append(account)
-                progress(size * len(accounts) // count)
+                progress(size * len(accounts) // segment_count)
     total = accounts[0]
     for account in accounts[1:]:
         total.add(account)
@@ -96,7 +97,7 @@ def _replay_segment(
     paths: Sequence[Path], tolerance_nm: float, kernel: str, segment: Segment, progress: Progress = lambda done: None
 ) -> Account:
     """Replay a segment, on one thread like the live loop: several threads sum in another order."""
-    run = Replay(tolerance_nm, segment, kernel)
+    replay = Replay(tolerance_nm, segment, kernel)
     log = WholeLog(paths, topics=TOPICS, from_ns=max(0, segment.from_ns - PATIENCE_NS), always=published.TOPICS)
     part = None
     gc.disable()
@@ -106,14 +107,14 @@ def _replay_segment(
                 if part is not log.parts[-1]:
                     part = log.parts[-1]
                     _refuse_thinned(part)
-                    run.begin_file(part.metadata)
-                    run.context.former = FormerVersion(part.schemas) if _is_former(part) else None
-                run.add(message)
+                    replay.begin_file(part.metadata)
+                    replay.context.former = FormerVersion(part.schemas) if _is_former(part) else None
+                replay.add(message)
                 if number % _PROGRESS_EVERY == 0:
                     progress(log.position)
-                if run.done:
+                if replay.done:
                     break
-            account = run.finish()
+            account = replay.finish()
     finally:
         gc.enable()
     named_metadata = [(part.path.name, part.metadata) for part in log.parts]

@@ -122,7 +122,7 @@ def why_no_stretch(run: Run) -> str:
 
 
 def stretch_results(run: Run, stretch: Stretch | None) -> Results | None:
-    """Results of the stretch and its law."""
+    """Results on the stretch and its law, for JSON; None without a stretch."""
     if stretch is None:
         return None
     steps = run.history.steps

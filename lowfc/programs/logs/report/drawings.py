@@ -103,8 +103,8 @@ def _intervals(figure: "Figure", report: Report) -> bool:
     styles = ("-", "--", "-.", ":", "-", "--")
     for (name, values), colour, style in zip(stages.items(), colours, styles, strict=False):
         ordered = np.sort(values)
-        places = np.geomspace(1, ordered.size, min(400, ordered.size)).astype(np.int64)
-        keep = ordered.size - np.unique(places)[::-1]  # denser towards the longest latency, which is kept
+        ranks = np.geomspace(1, ordered.size, min(400, ordered.size)).astype(np.int64)
+        keep = ordered.size - np.unique(ranks)[::-1]  # denser towards the longest latency, which is kept
         beyond = 1 - keep / ordered.size
         right.plot(np.maximum(ordered[keep], 0.1), beyond, label=name.replace("_", " "), color=colour, linestyle=style)
     if stages:
@@ -154,12 +154,12 @@ def _spectra(figure: "Figure", report: Report) -> bool:
         above, below = grid[0][column], grid[1][column]
         frequency_hz, power = group["frequency_hz"], {k: np.array(v) for k, v in group["power_nm2_hz"].items()}
         true = "disturbance" in power
-        quiet = _BESIDE_TRUTH if true else {}
-        above.plot(frequency_hz, power["pseudo_open_loop"], color=OPEN, label="open: pseudo-open-loop", **quiet)
-        above.plot(frequency_hz, power["error"], color=CLOSED, label="closed: measured error", **quiet)
+        measured = _BESIDE_TRUTH if true else {}
+        above.plot(frequency_hz, power["pseudo_open_loop"], color=OPEN, label="open: pseudo-open-loop", **measured)
+        above.plot(frequency_hz, power["error"], color=CLOSED, label="closed: measured error", **measured)
         ratio = np.sqrt(_ratio(power["error"], power["pseudo_open_loop"]))
         theory = np.sqrt(_ratio(power["error_predicted"], power["pseudo_open_loop"]))
-        below.plot(frequency_hz, ratio, color=CLOSED, label="measured error / pseudo-open-loop", **quiet)
+        below.plot(frequency_hz, ratio, color=CLOSED, label="measured error / pseudo-open-loop", **measured)
         below.plot(frequency_hz, theory, color=INK, linestyle="--", linewidth=0.9, label="theory: rejection")
         if true:
             above.plot(frequency_hz, power["disturbance"], color=OPEN, label="open: true disturbance")
@@ -169,8 +169,8 @@ def _spectra(figure: "Figure", report: Report) -> bool:
         if "residual_predicted" in power:
             style = {"color": INK, "linestyle": "--", "linewidth": 0.9}
             above.plot(frequency_hz, power["residual_predicted"], label="closed: theory, rejection and noise", **style)
-            clear = power["disturbance_left"] > 0.5 * power["residual_predicted"]
-            rejected = np.where(clear, np.sqrt(_ratio(power["residual"], power["disturbance"])), np.nan)
+            above_noise = power["disturbance_left"] > 0.5 * power["residual_predicted"]
+            rejected = np.where(above_noise, np.sqrt(_ratio(power["residual"], power["disturbance"])), np.nan)
             label = "true residual / disturbance, where noise is lower"
             below.plot(frequency_hz, rejected, "o", color=CLOSED, markersize=4, markerfacecolor="none", label=label)
         above.set(title=group["name"], xscale="log", yscale="log")

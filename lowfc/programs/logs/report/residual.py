@@ -20,8 +20,8 @@ from lowfc.programs.logs.report.source import Results, Run, row_after
 def residual_results(run: Run, stretch: Stretch | None) -> Results:
     """Rms in nm of each mode and signal, and of tip and tilt per axis in mas; None for signals not in the log.
 
-    Closed loop: over the longest stretch under one law, after settling. Open loop: over all open-loop steps under the
-    last calibration.
+    Closed-loop values are over the longest stretch under one law, after settling; open-loop values are over all
+    open-loop steps under the last calibration.
     """
     history = run.history
     steps = history.steps

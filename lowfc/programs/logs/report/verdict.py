@@ -11,9 +11,9 @@ from lowfc.programs.logs.report.source import Results
 GOOD, LOOK, BAD, UNKNOWN = "good", "look", "bad", "unknown"
 _LEVELS = {Correction.GOOD: GOOD, Correction.LITTLE: UNKNOWN, Correction.HARM: LOOK}
 
-_MANY_WITHOUT_COMMAND = 0.01
-_MANY_LATE = 0.01
-_MUCH_STROKE = 0.9
+_MANY_WITHOUT_COMMAND = 0.01  # fraction of the frames
+_MANY_LATE = 0.01  # commands per step
+_MUCH_STROKE = 0.9  # fraction of the stroke limit
 
 
 def verdict(results: Results) -> Results:

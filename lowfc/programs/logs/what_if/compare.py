@@ -71,7 +71,7 @@ def what_if(run: LoggedRun, changes: WhatIf) -> dict[str, Any]:
     contrast = None
     columns = {"open": rms(pol_nm, rows), "was": rms(was_nm, rows), "what_if": rms(what_if_nm, rows)}
     if run.true_nm is not None:
-        true, contrast = _true(run, rows, what_if_nm - pol_nm - seen_nm, command_nm)
+        true, contrast = _true_residuals(run, rows, what_if_nm - pol_nm - seen_nm, command_nm)
         columns |= true
     return {
         "log": str(run.history.log.path),
@@ -103,17 +103,17 @@ def what_if(run: LoggedRun, changes: WhatIf) -> dict[str, Any]:
             *_log_warnings(run),
             *([f"the log lacks {counted(int(lost), 'used frame')}: the what-if holds its command"] if lost else []),
             *_range_warnings(run.calibration, columns),
-            *_weighting_warnings(run, calibration, None if user_step else new_law),
+            *_prior_warnings(run, calibration, None if user_step else new_law),
             *([] if user_step else _automatic_warnings(changes, noll)),
             *([] if user_step else _law_warnings(run, new_law, command_nm[rows])),
         ],
     }
 
 
-def _true(
+def _true_residuals(
     run: LoggedRun, rows: Mask, moved_nm: Single, command_nm: Single
 ) -> tuple[dict[str, Array], dict[str, Any] | None]:
-    """Rms (modes,) in nm of the true residual, sampled in the frames and continuous, as logged and for the what-if.
+    """Rms (modes,) in nm of the true residual, at the frames and at all times, as logged and for the what-if.
 
     `moved_nm` (steps, modes) is the what-if's command minus the logged one, as seen by each exposure; `command_nm` is
     the what-if's command. The second value is the contrast that the continuous residual adds to the dark zone, or None.
@@ -239,7 +239,7 @@ def _tilt_mas(run: LoggedRun, columns: dict[str, Array]) -> dict[str, float]:
     if run.history.configuration is None or not tilts.any():
         return {}
     nm_per_mas = tilt_nm_per_mas(run.history.configuration.star.diameter_m)
-    return {f"tilt_{name}_mas": float(np.sqrt(np.mean(rms[tilts] ** 2))) / nm_per_mas for name, rms in columns.items()}
+    return {f"tilt_{name}_mas": float(np.sqrt(np.mean(nm[tilts] ** 2))) / nm_per_mas for name, nm in columns.items()}
 
 
 def _log_warnings(run: LoggedRun) -> list[str]:
@@ -310,14 +310,16 @@ def _range_warnings(calibration: Calibration, columns: dict[str, Array]) -> list
     ]
 
 
-def _weighting_warnings(run: LoggedRun, calibration: Calibration, law: Integrator | None) -> list[str]:
-    weighted = run.uncorrected
-    if not weighted.any() or (calibration is run.calibration and law is not None and not law.gain[weighted].any()):
+def _prior_warnings(run: LoggedRun, calibration: Calibration, law: Integrator | None) -> list[str]:
+    uncorrected = run.uncorrected
+    if not uncorrected.any() or (
+        calibration is run.calibration and law is not None and not law.gain[uncorrected].any()
+    ):
         return []
-    names = ", ".join(mode_name(index) for index in np.array(run.calibration.noll)[weighted].tolist())
+    names = ", ".join(mode_name(index) for index in np.array(run.calibration.noll)[uncorrected].tolist())
     return [
-        f"automatic gains weighted the logged reconstructor for modes that they do not correct ({names}): the what-if "
-        "measures with the same weights, also if it corrects such a mode"
+        f"the logged reconstructor has a prior of the modes that automatic gains did not correct ({names}): the "
+        "what-if measures with the same prior, even if it corrects such a mode"
     ]
 
 
@@ -333,7 +335,7 @@ def _law_warnings(run: LoggedRun, law: Integrator, command_nm: Single) -> list[s
     """Remarks on instability and modal limits of the what-if with its commands `command_nm` (frames, modes)."""
     found = []
     noll = run.calibration.noll
-    # The measured delay is a mean over punctual and late frames, not the constant weighting of a fractional delay.
+    # A measured delay is a mean over punctual and late frames, not a constant fractional delay: round it up.
     delay_frames = run.delay_frames if run.delay_frames == run.controller_delay else np.ceil(run.delay_frames)
     highest = {leak: limiting_gain(delay_frames, leak) for leak in set(law.leak.tolist())}
     unstable = [

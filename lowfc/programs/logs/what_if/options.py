@@ -46,15 +46,15 @@ class WhatIf:
 
 
 def requested_changes(
-    sets: str | None = None, config: Path | None = None, calibration: Path | None = None, controller: str | None = None
+    pairs: str | None = None, config: Path | None = None, calibration: Path | None = None, controller: str | None = None
 ) -> WhatIf:
-    """Parse the options of the command line; `sets` is the text of --set.
+    """Parse the options of the command line; `pairs` is the text of --set: KEY=VALUE,...
 
     A controller is FILE.py:NAME of a function `step(state, error_nm) -> (state, command_nm)`; the state is None at
-    first, both arrays are (modes,) nm of wavefront rms.
+    first; both arrays are (modes,) nm rms of wavefront.
     """
     values: dict[str, str] = {}
-    for part in filter(None, (part.strip() for part in (sets or "").split(","))):
+    for part in filter(None, (part.strip() for part in (pairs or "").split(","))):
         key, _, value = (piece.strip() for piece in part.partition("="))
         if key not in KEYS:
             raise ConfigurationError(f"--set: unknown key {key!r}{nearest(key, KEYS)}; the keys are {', '.join(KEYS)}")
