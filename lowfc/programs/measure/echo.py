@@ -1,8 +1,8 @@
 """A bare zenoh echo, the reference for a loop's latency: a frame out, a command back, no work in between.
 
 Two processes, each with a plain zenoh session, use the loop's links and its settings of session, publishers and
-scheduling. The process that answers is set up like the controller; afterwards it times the control step and the host's
-timer.
+scheduling. The process that answers is set up like the controller; after the echo it times the control step and the
+host's timer.
 """
 
 import dataclasses
@@ -89,7 +89,7 @@ def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float) ->
         keep_thread_state()
         assert sample.attachment is not None  # noqa: S101  # sent by `answer`
         index, time_ns = Envelope.decode_checked(sample.attachment.to_bytes())
-        sample.payload.to_bytes()
+        sample.payload.to_bytes()  # read as the mirror reads a command
         round_trip_ns[index] = now_ns - time_ns
 
     session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(run.links, Role.CAMERA))))
@@ -143,7 +143,7 @@ def _answer(config: Configuration, run: Run, command: bytes) -> None:
 
 
 def _join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Run:
-    """Set this process up like the loop's process of this role; return the run, with camera and controller only."""
+    """Set this process up like the loop's process of this role; return the run with the links of both only."""
     prepare(config, role, cpus)
     run = open_run(run_id, (config.mirror.name,))
     ports = {str(role): run.links.ports[role] for role in (Role.CAMERA, Role.CONTROLLER)}

@@ -33,10 +33,10 @@ SENT_FILE = "sent.npz"
 BEGIN_FILE = "begin"
 """File in the run's directory: time at which the first frame is due, ns."""
 
-_COUNT = 32  # number of different frames, sent in turns
+_COUNT = 32  # number of different frames; they are sent over and over in this order
 _TILT_NM, _OTHER_NM = 3.0, 1.0  # amplitudes, nm rms
-_MAX_CYCLES = 3  # oscillations of a mode in _COUNT frames
-_WAIT_S = 60.0  # a view may have to load
+_MAX_CYCLES = 3  # largest number of oscillations of a mode in _COUNT frames
+_WAIT_S = 60.0  # longest wait for the other processes: a view takes long to load
 _FIRST_FRAME_PERIODS = 10  # periods from the start to the first frame
 
 app = new_app("A camera that sends prepared frames.")
@@ -68,7 +68,7 @@ class Payloads:
             self._bodies.append(message.SerializeToString())
 
     def at(self, index: int, time_ns: int) -> bytes:
-        """Payload number `index` with this time stamp: encoded protobuf fields can be concatenated."""
+        """Payload `index` (modulo their number) with this time stamp: encoded protobuf fields can be concatenated."""
         head = RawImage(timestamp=timestamp(time_ns)).SerializeToString()
         return head + self._bodies[index % len(self._bodies)]
 

@@ -32,8 +32,8 @@ _TIME_NS = 1_767_225_600_000_000_000
 
 _VARIETY = 32  # number of different frames: a payload repeats only beyond the window of the log's compression
 _TIMING_HZ = 10.0
-_BEAT_FRAMES = 50
-_WAIT_S = 0.05
+_BEAT_FRAMES = 50  # frames from one call of `beat` to the next
+_WAIT_S = 0.05  # time for which each role in turn waits for a process
 
 
 class Traffic:

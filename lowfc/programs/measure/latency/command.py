@@ -58,7 +58,8 @@ def latency(
 
     Prepared frames are sent on an absolute schedule and late frames are counted, so that stalls are not hidden. A bare
     zenoh echo of messages of the same sizes, one control step alone and the host's timer are measured in turns with
-    the loop. Times are from just before a frame is published to just after its command is sent.
+    the loop. The latency from frame to command begins just before the frame is published, and ends
+    just after its command is sent.
 
     Example: lowfc latency --duration 10 --repeats 5 --json > latency.json
     """
@@ -97,7 +98,7 @@ def latency(
 
 
 def _refuse_others(context: typer.Context, chosen: str, *allowed: str) -> None:
-    """Refuse the options that have no effect with `--compare` or with logs, which are `chosen`."""
+    """Refuse the options that have no effect with the option or argument `chosen`; `allowed` have one."""
     for option in options_set(context):
         if option not in (chosen, *allowed):
             raise ConfigurationError(f"{option} has no effect with {chosen}: omit it")

@@ -128,7 +128,7 @@ def frame_outcomes(
 
 
 def percentiles(values: npt.NDArray[Any]) -> dict[str, float] | None:
-    """The `PERCENTILES` of the finite values, not interpolated: each is one of the values; None if there is none."""
+    """The `PERCENTILES` of the finite values, not interpolated: each is one of the values; None if none is finite."""
     finite = np.sort(values[np.isfinite(values)])
     if not finite.size:
         return None

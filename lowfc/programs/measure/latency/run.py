@@ -1,7 +1,7 @@
 """The live latency test: controller and mirror driven by a frame source, then the references.
 
 Every repeat starts its processes anew: first those of the loop, then those of the bare echo, which also time the
-control step and the host's timer alone. No other process of lowfc runs meanwhile.
+control step and the host's timer alone. The two groups never run at the same time.
 """
 
 import contextlib
@@ -43,9 +43,9 @@ from lowfc.programs.measure.latency.frame_statistics import (
 from lowfc.programs.measure.latency.stalls import Trace, stalls_of
 
 _POLL_S = 0.25
-_RING = 1 << 14
-_SETTLE_S = 0.15
-_LAST_HEALTH_S = 0.1
+_RING_SIZE = 1 << 14  # messages
+_SETTLE_S = 0.15  # for the last command and mirror state to arrive
+_LAST_HEALTH_S = 0.1  # for the last Health to arrive
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ def one_loop(options: LatencyOptions, run: Run, children: list[Child] | None = N
     Only timing (10 Hz), Health and a poll (4 Hz) wake this process; frames and mirror states wait in rings.
 
     Args:
-        options: options.
+        options: options of `lowfc latency`.
         run: run with the files that the processes share.
         children: processes in place of those of `lowfc latency`; the first ends by itself, and one of them writes
             `SENT_FILE`.
@@ -135,8 +135,8 @@ def one_loop(options: LatencyOptions, run: Run, children: list[Child] | None = N
         stack.callback(bus.close)
         bus.subscribe(HEALTH, watch.add_health)
         bus.subscribe(TIMING, add_timing)
-        state_ring = bus.ring(MIRROR_STATE, _RING)
-        frame_ring = bus.ring(FRAME, _RING) if options.simulated else None
+        state_ring = bus.ring(MIRROR_STATE, _RING_SIZE)
+        frame_ring = bus.ring(FRAME, _RING_SIZE) if options.simulated else None
         stack.callback(stop_all, children)
         _run_children(children, children[: 1 + len(traced)], drain, partial(_write_pids, run, children))
         time.sleep(_SETTLE_S)
@@ -178,7 +178,7 @@ def _children(options: LatencyOptions, run: Run) -> list[Child]:
     if options.view:
         arguments = ["-m", "lowfc", "view", "--run", run.run_id, "--web"]
         view = program(str(Role.VIEWER), arguments, run.path / f"{Role.VIEWER}.stderr")
-        children.insert(len(children) - options.record, view)  # the recorder ends last
+        children.insert(len(children) - options.record, view)  # the recorder is stopped after it
     if not options.simulated:
         waits = [argument for child in children[1:] for argument in ("--wait-for", child.name)]
         arguments = ["-m", "lowfc.programs.measure.frame_source", *_options(run), "--seconds", str(seconds), *waits]

@@ -97,7 +97,7 @@ class Stalls(Result):
 
 
 def signs_of(counted: CountChanges, period_us: float) -> tuple[list[str], list[str]]:
-    """Evidence that the host caused a stall, and that the loop did; delays too short for a stall are ignored."""
+    """Evidence that the host caused a stall, and that the loop did; delays shorter than `_MIN_PERIODS` are ignored."""
     long_us = _MIN_PERIODS * period_us
     host = {
         f"bare loop {counted.bare_late_us:.0f} us late": counted.bare_late_us >= long_us,
@@ -113,7 +113,7 @@ def signs_of(counted: CountChanges, period_us: float) -> tuple[list[str], list[s
 
 
 def stalls_of(frames: FrameOutcomes, period_ns: int, traces: Mapping[str, Trace]) -> Stalls:
-    """The stalls among these frames, the warm-up left out; `traces` of bare loops are by the role beside."""
+    """The stalls among these frames, the warm-up left out; `traces` has bare loops by the role beside them."""
     command_us = frames.spans_us["frame_to_command"]
     after_warm_up = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
     slow = after_warm_up & (~frames.commanded | (command_us * 1e3 > period_ns))
@@ -186,7 +186,7 @@ def _counted(trace: Trace, begin_ns: int, end_ns: float) -> CountChanges:
 
 
 def _bare(role: str, trace: Trace, period_ns: int) -> BareLoop:
-    """Wakings of the bare loop beside the process with this role."""
+    """Wake-ups of the bare loop beside the process with this role, and how late they were."""
     late_ns = trace.woke_ns - trace.due_ns
     late_us = percentiles(late_ns / 1e3)
     return BareLoop(beside=role, wakings=late_ns.size, stalled=int(np.sum(late_ns > period_ns)), late_us=late_us)

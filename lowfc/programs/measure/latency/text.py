@@ -16,7 +16,7 @@ _ALWAYS = ("frames", "frames_without_command", "warm_up_frames", "messages_lost"
 _HOST = ("processor", "processors", "kernel", "python", "clock_source", "load")
 _BLOCKS = " ▁▂▃▄▅▆▇█"
 _LINE = 32
-"""Characters of a histogram in the table."""
+"""Largest number of characters of a histogram in the table."""
 
 
 def table(results: Mapping[str, Any]) -> str:
@@ -61,9 +61,9 @@ def compared(comparison: Mapping[str, Any]) -> str:
 
 
 def sparkline(counts: Sequence[int]) -> str:
-    """Counts as blocks of logarithmic height; many bins are combined into at most `_LINE`."""
-    bins = math.ceil(len(counts) / _LINE)  # bins combined in one block
-    sums = [sum(counts[start : start + bins]) for start in range(0, len(counts), bins)]
+    """Counts as at most `_LINE` blocks of logarithmic height; a block may combine several bins."""
+    per_block = math.ceil(len(counts) / _LINE)  # bins
+    sums = [sum(counts[start : start + per_block]) for start in range(0, len(counts), per_block)]
     highest = math.log1p(max(sums, default=0)) or 1.0
     return "".join(_BLOCKS[math.ceil(math.log1p(count) / highest * (len(_BLOCKS) - 1))] for count in sums).rstrip()
 
