@@ -27,7 +27,7 @@ class Gains(Lines):
     """The knobs, scrolled to the chosen one. Keys or a click turn a knob; the gains of its modes keep their ratios."""
 
     def __init__(self, send: Callable[[Sequence[int], Sequence[float]], None]) -> None:
-        """Make the knobs; `send` receives the modes of a knob and their new gains; no gains: automatic gains."""
+        """Make the knobs; `send` receives a knob's modes and their new gains, or an empty list for automatic gains."""
         super().__init__("gains")
         self._send = send
         self._chosen = self._top = 0  # index of the chosen knob, and of the first knob on the screen
@@ -54,7 +54,7 @@ class Gains(Lines):
         self._draw()
 
     def turn(self, steps: int) -> None:
-        """Turn the chosen knob by this number of steps, up if positive; the steps of small gains are fine."""
+        """Turn the chosen knob up by this number of steps: `FINE_STEP` for a small gain, otherwise `STEP`."""
         if self._noll:
             gain = round(self._shown_gain(self._chosen), 3)  # the controller's gains are float32
             fine = gain < FINE_BELOW or (steps < 0 and gain <= FINE_BELOW)

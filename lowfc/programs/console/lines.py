@@ -10,7 +10,7 @@ from textual.widget import Widget
 
 
 class Lines(Widget):
-    """One text for each line of the screen, cut off at the right; textual's `Static` redraws all lines."""
+    """One text for each line of the screen, cut off at the right. Textual's `Static` would redraw all lines."""
 
     ALLOW_SELECT = False
 

@@ -44,7 +44,7 @@ class Actions(NamedTuple):
     events: tuple[PendingEvent, ...] = ()
 
 
-NOTHING = Actions()
+NO_ACTIONS = Actions()
 
 
 class _Group:
@@ -94,7 +94,7 @@ class GainWatch:
         """Process a step and the state after it."""
         loop = state.loop
         if loop is None or not loop.calibration.noll:
-            return NOTHING
+            return NO_ACTIONS
         self.prepare(loop)
         if loop.weighting is not self._weighting:
             self._weighting = weighting = loop.weighting
@@ -105,7 +105,7 @@ class GainWatch:
                 group.bank.use_reconstructor(from_own_modes[np.ix_(group.mask, group.mask)])
         newest, before = state.frame_sequence, self._newest
         if step.frame_sequence != newest or newest == before:  # not a new exposure
-            return NOTHING
+            return NO_ACTIONS
         self._newest = newest
         same_camera = newest >> COUNT_BITS == before >> COUNT_BITS
         missing = newest - before - 1 if same_camera and newest > before else 1  # `clear` may lower the sequence
@@ -119,7 +119,7 @@ class GainWatch:
             or state.mode not in (LoopMode.OPEN, LoopMode.CLOSED)
         ):
             self._hold(missing + 1)
-            return NOTHING
+            return NO_ACTIONS
         if missing:
             self._hold(missing)
         open_nm = step.pol_nm if channels is None else step.pol_nm - channels.offset_nm
@@ -143,7 +143,7 @@ class GainWatch:
             )
         ]
         if not judged:
-            return Actions(events=events) if events else NOTHING
+            return Actions(events=events) if events else NO_ACTIONS
         actions = self._judge(judged, step, state, loop)
         return actions._replace(events=(*events, *actions.events))
 

@@ -69,7 +69,7 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
             sys.stderr.write(f"gateway: run {run_id} was started again, and the gateway has joined it\n")
 
 
-def _serve(loop: Client, watch: Watch, gateway: EpicsGateway, ended: Callable[[], bool]) -> None:
+def _serve(client: Client, watch: Watch, gateway: EpicsGateway, ended: Callable[[], bool]) -> None:
     """Post the variables and publish the bench values of one run until it has `ended`."""
     due_s, bench_s = 0.0, 0.0
     while not ended():
@@ -78,11 +78,11 @@ def _serve(loop: Client, watch: Watch, gateway: EpicsGateway, ended: Callable[[]
             gateway.changed.clear()
             bench_s = now_s + BENCH_PERIOD_S
             for name, value in list(gateway.bench.items()):
-                loop.bench(name, value)
+                client.bench(name, value)
         if now_s >= due_s:
             due_s = now_s + PERIOD_S
             view = watch.update()
-            status = json_object(view.state, view.processes, loop.run_id)
+            status = json_object(view.state, view.processes, client.run_id)
             values = {each.name: each.read(view, status) for each in gateway.variables if each.read is not None}
             gateway.update(values, "" if view.connected else "the controller does not answer")
         gateway.changed.wait(max(0.0, min(due_s, bench_s) - time.monotonic()))

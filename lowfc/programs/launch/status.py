@@ -17,7 +17,7 @@ from lowfc.programs.cli.contrast import QUADRATIC, contrast_cases, contrast_in_w
 from lowfc.programs.launch.watch import Watch, mode_name, topic_count, wavefront
 
 SILENT_S = 2.0
-"""Time without Health (sent twice a second) after which the values of a process are no longer shown."""
+"""Time without Health (sent twice a second) after which a notice replaces the frame rate and the wavefront."""
 _RECENT_S = 2.5
 """Span of the recent wavefront statistics, plus the delay of their report."""
 _EVENTS_SHOWN = 4

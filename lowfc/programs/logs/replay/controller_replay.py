@@ -42,7 +42,7 @@ class _Entry:
 
     @property
     def leads_to_command(self) -> bool:
-        """Whether a controller with a calibration sends a command after this input."""
+        """Whether a controller with a calibration may send a command after this input."""
         logged = self.logged
         return isinstance(logged, wire.ControlStep) or (
             isinstance(logged, wire.ControlInput) and logged.HasField("tick")

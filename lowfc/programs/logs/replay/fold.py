@@ -48,17 +48,17 @@ class Replay:
         self._last_ns = now_ns = message.receive_time_ns
         if now_ns < context.segment.from_ns - PATIENCE_NS and topic not in published.TOPICS:
             return
-        inside = context.segment.from_ns <= now_ns < context.segment.until_ns
+        in_segment = context.segment.from_ns <= now_ns < context.segment.until_ns
         if topic is FRAME:
             context.frames.add(message.sequence, message.payload)
-            if inside:
+            if in_segment:
                 context.account.span_ns = context.account.span_ns[0] or now_ns, now_ns
         elif topic in published.TOPICS:
             context.published.store(topic, message.payload)
             for controller in self._controllers.values():
                 controller.retry_pending = True
         elif topic in TOPICS:
-            context.account.steps += topic is STEP and inside
+            context.account.steps += topic is STEP and in_segment
             with contextlib.suppress(DecodeError):  # the input of an unreadable message counts as missing
                 self._controller(message).add(message, topic.message)
 

@@ -113,7 +113,7 @@ def signs_of(counted: CountChanges, period_us: float) -> tuple[list[str], list[s
 
 
 def stalls_of(frames: FrameOutcomes, period_ns: int, traces: Mapping[str, Trace]) -> Stalls:
-    """The stalls among these frames, the warm-up left out; `traces` has bare loops by the role beside them."""
+    """The stalls among these frames, the warm-up left out; `traces` has the bare loop beside each role's process."""
     command_us = frames.spans_us["frame_to_command"]
     after_warm_up = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
     slow = after_warm_up & (~frames.commanded | (command_us * 1e3 > period_ns))
