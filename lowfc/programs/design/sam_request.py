@@ -57,9 +57,9 @@ class Search:
             raise ValueError(f"--name must consist of letters, digits, _ and -, got {self.name!r}")
         for option, value in {"chains": self.chains, "steps": self.steps}.items():
             if value < 1:
-                raise ValueError(f"{option} must be at least 1, got {value}")
+                raise ValueError(f"--{option} must be at least 1, got {value}")
         if self.seed < 0:
-            raise ValueError(f"the seed must not be negative, got {self.seed}")
+            raise ValueError(f"--seed must not be negative, got {self.seed}")
         _ = self.goal, self.bounds  # validated here
         if len(self.focal_masks) > 1 and not for_paper:
             raise ValueError(f"the merit {self.merit!r} uses one focal-plane mask; only 'paper' uses both")

@@ -150,7 +150,7 @@ def _supervise(
     with deferred_signals() as interrupted, display as live:
         begun_s = time.monotonic()
         while camera.status is None and watch.health_of(Role.CAMERA).state != "stopped" and not interrupted():
-            check(children[1:])
+            raise_if_died(children[1:])
             if view is not None and view.status is not None:
                 _report_view_ended(view, console)
                 view = None
@@ -163,7 +163,7 @@ def _supervise(
                     sys.stderr.write(status_line(watch, elapsed_s, config.lockstep_hz) + "\n")
             time.sleep(POLL_S)
         if not interrupted():
-            check(children)
+            raise_if_died(children)
         if interrupted():
             camera.stop(timeout_s=5.0)
         time.sleep(SETTLE_S)
@@ -184,7 +184,7 @@ def died(child: Child) -> ProcessDiedError:
     return ProcessDiedError(child.exit_description() + (f"; the end of its output:\n{tail}" if tail else ""))
 
 
-def check(children: list[Child]) -> None:
+def raise_if_died(children: list[Child]) -> None:
     """Raise ProcessDiedError if a process ended unexpectedly; a view may end at any time, a camera after its frames."""
     for child in children:
         may_end = child.name == Role.VIEWER or (child.name == Role.CAMERA and child.status == 0)

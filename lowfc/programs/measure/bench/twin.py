@@ -36,7 +36,7 @@ def twin(as_json: Json = False) -> None:
 def bench_twin(seconds: float = 1.0) -> dict[str, Any]:
     """Measure three twins; the results of the first, the default of the live loop, are also at the top level.
 
-    Each time is the median for one frame, from the wavefront to the binned image; the models are timed one by one.
+    Each time is the median for one frame, from the wavefront to the binned image; each model is timed for `seconds`.
     `relative_l2` is the largest relative error of the image over 20 random wavefronts of radial degrees 1 to 5, within
     the bounds of Subedi et al. 2015, Sect. 3.1.
     """

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.adapters.logs.columns import STAGES as TIMED
+from lowfc.adapters.logs.columns import STAGES as ALL_STAGES
 from lowfc.adapters.logs.columns import rows_of
 from lowfc.arrays import Array, Long, Mask, Sequences
 from lowfc.contract.messages import FRAME, wire
@@ -16,7 +16,7 @@ from lowfc.programs.launch.watch import topic_count
 
 WARM_UP_S = 0.5
 """Frames published within this time after the first one are left out."""
-STAGES = TIMED[1:-1]
+STAGES = ALL_STAGES[1:-1]
 """Stages from receive to command, as in ControlTiming."""
 LOOP_SPANS = ("frame_to_receive", "receive_to_command", "frame_to_command", "command_to_mirror", "frame_to_mirror")
 PERCENTILES = {"p50": 500, "p90": 900, "p99": 990, "p99_9": 999, "max": 1000}
