@@ -32,7 +32,7 @@ _IMPORT_AFTER_S = 4.0
 """Time after which a thread does the slow imports: the first values do not need them."""
 _PUNCTUAL_S = 0.5
 """Longest time between two readings; after a longer one, the messages received meanwhile count as delayed."""
-_TREND_STEP_NS = 1_000_000_000
+_TREND_STEP_NS = 1_000_000_000  # time from one value of a sparkline to the next
 _HIDDEN_REQUESTS = frozenset(("status", "configuration", "renew"))
 """Requests that programs repeat periodically, and that leave the loop unchanged."""
 

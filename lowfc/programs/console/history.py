@@ -8,7 +8,7 @@ from rich.text import Text
 from lowfc.contract.messages import Log, from_timestamp, wire
 from lowfc.programs.console import panels
 
-_LINES = 200
+_LINES = 200  # largest number of lines that are kept
 _REPEAT_S = 10.0
 """An event that repeats another within this time, apart from numbers, is shown once, with its count."""
 _SEARCHED = 8  # number of last lines that are searched for a repeated event

@@ -24,7 +24,7 @@ from lowfc.programs.view.verdicts.watcher import SILENT_S
 
 _PIXELS = 12
 """Rows and columns of a picture; two rows share a line of text."""
-_MODE_LINES = 7
+_MODE_LINES = 7  # modes in one column
 _SPARKS = "▁▂▃▄▅▆▇█"
 _NEAR_LIMIT = 0.95  # fraction of the modal limit from which a command is drawn in red
 _GAINS = re.compile(r", gain .*?(?=, leak|;)")

@@ -12,7 +12,7 @@ _KEYS = {name: action.key for name, action in ALL_ACTIONS.items()} | {
 }
 _COMMAND = re.compile(r"`lowfc ctl (\w+)(?: (\w+))?( --modes [^` ]*)?[^`]*`")
 _NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
-_LIST = re.compile(rf"(?<![\w.]){_NUMBER}(?: {_NUMBER}){{3,}}(?![\w.])")
+_LIST = re.compile(rf"(?<![\w.]){_NUMBER}(?: {_NUMBER}){{3,}}(?![\w.])")  # four numbers or more
 
 
 def phrased(text: str) -> str:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-_TAIL_BYTES = 4000
+_TAIL_BYTES = 4000  # end of the output, of which the last line or the error is shown
 
 
 class Task:

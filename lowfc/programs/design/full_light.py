@@ -17,7 +17,7 @@ from lowfc.design.merit import WAVELENGTH_NM
 from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.design.full_light_request import Sizes
 
-KEYS = {"zwfs": "spot_diameter", "clowfs": "defocus_mm"}
+KEYS = {"zwfs": "spot_diameter", "clowfs": "defocus_mm"}  # key of [sensor] with the size, by kind of sensor
 _POINTS = 21  # sizes at which a sensor is evaluated before the optimisation
 
 

@@ -18,7 +18,7 @@ from lowfc.design.sam_search import Chain
 from lowfc.optics.chain.sam import Layout
 from lowfc.programs.design.sam_request import Search
 
-_MAX_BYTES = 1 << 26
+_MAX_BYTES = 1 << 26  # largest state file that is read
 UNITS = "pupil diameters, origin at the pupil centre, x to the right (columns), y up the row index"
 
 

@@ -25,13 +25,13 @@ from lowfc.contract.messages import (
 )
 
 _MODES = 14
-_GRID = (34, 34)
+_GRID = (34, 34)  # rows and columns of actuators
 _FRAME_SHAPE = (80, 80)
 _MIRROR = "dm"
-_TIME_NS = 1_767_225_600_000_000_000
+_TIME_NS = 1_767_225_600_000_000_000  # time stamp of every message: 2026-01-01 UTC
 
 _VARIETY = 32  # number of different frames: a payload repeats only beyond the window of the log's compression
-_TIMING_HZ = 10.0
+_TIMING_HZ = 10.0  # messages of stage durations per second
 _BEAT_FRAMES = 50  # frames from one call of `beat` to the next
 _WAIT_S = 0.05  # time for which each role in turn waits for a process
 

@@ -53,8 +53,7 @@ from lowfc.optics.chain.zernike import zernikes
 from lowfc.programs.logs.export.columns import step_columns
 from lowfc.programs.logs.export.cubes import copy_frames_to_fits, fits_cube
 
-_COMMANDS = "COMMANDS"
-_FRAMES = "FRAMES"
+_COMMANDS, _FRAMES = "COMMANDS", "FRAMES"  # names of the images that are copied from the log
 _MODES_PIXELS = 64  # rows and columns of a mode's image
 _NM = 1e-9
 

@@ -26,7 +26,7 @@ from lowfc.programs.logs.replay.frames import Frames
 
 PATIENCE_NS = 2_000_000_000
 """Longest log time to wait for a message of another publisher, because a log is in the order of arrival."""
-_STATES_KEPT = 256
+_STATES_KEPT = 256  # newest replayed states, or logged states while none is adopted
 _BEFORE_STATE = "recorded before the first complete state of the controller"
 
 

@@ -15,9 +15,9 @@ Masks = dict[str, Mask]
 Entry = tuple[Term | None, str]
 """A term and its source; or None, and what the term would require."""
 
-_THROUGH = "times the loop's noise transfer"
-_NO_CAMERA = "a calibration, light, and the camera's gain"
-_TOO_SHORT = "a longer stretch with the loop closed"
+_TIMES_TRANSFER = "times the loop's noise transfer"
+_NOISE_REQUIRES = "a calibration, light, and the camera's gain"
+_SPECTRA_REQUIRE = "a longer stretch with the loop closed"
 
 
 def budget_results(
@@ -64,17 +64,17 @@ def _terms(stretch: Stretch, spectra: Spectra | None, noise: SensorNoise | None,
     law, timing = stretch.law, stretch.timing
     entries: dict[str, Entry] = {}
     if noise is None:
-        entries = dict.fromkeys(("photon noise", "read noise"), (None, f"requires {_NO_CAMERA}"))
+        entries = dict.fromkeys(("photon noise", "read noise"), (None, f"requires {_NOISE_REQUIRES}"))
     else:
         for name, frame_nm, source in (
             ("photon noise", noise.photon_nm, "measured flux"),
             ("read noise", noise.read_nm, "camera's read noise, rounding and dark charge"),
         ):
-            how = f"{source}, through the reconstructor, {_THROUGH}"
+            how = f"{source}, through the reconstructor, {_TIMES_TRANSFER}"
             how = how if noise.total_nm.any() else "the simulation has no noise"
             entries[name] = (white_noise(law, frame_nm, timing), how)
     if spectra is None:
-        entries["lag"] = (None, f"requires {_TOO_SHORT}")
+        entries["lag"] = (None, f"requires {_SPECTRA_REQUIRE}")
     elif stretch.true:
         mean_nm = stretch.signal(DISTURBANCE).joined().mean(axis=0)
         how = "spectrum of the true disturbance times the rejection"
@@ -90,13 +90,13 @@ def _terms(stretch: Stretch, spectra: Spectra | None, noise: SensorNoise | None,
 
 
 def _measurement_terms(stretch: Stretch, noise: SensorNoise | None, *, shaped: bool) -> tuple[Entry, Entry]:
-    split, missing = None, _TOO_SHORT
+    split, missing = None, _SPECTRA_REQUIRE
     if not stretch.true:
         missing = "the true wavefront, known only in simulation"
     elif shaped:
         missing = "a stretch without offset and channels, whose shapes are in the true residual"
     elif noise is None:
-        missing = _NO_CAMERA
+        missing = _NOISE_REQUIRES
     else:
         error, pol = stretch.signal(ERROR), stretch.signal(POL)
         command_seen = replace(error, values=tuple(a - b for a, b in zip(error.values, pol.values, strict=True)))
@@ -106,7 +106,7 @@ def _measurement_terms(stretch: Stretch, noise: SensorNoise | None, *, shaped: b
         return unknown, unknown
     linear = "linear part of (error - true residual): fit to a constant, the residual and the command"
     remainder = "remainder of (error - true residual) beyond the noise of a frame"
-    return (split.crosstalk, f"{linear}, {_THROUGH}"), (split.nonlinearity, f"{remainder}, {_THROUGH}")
+    return (split.crosstalk, f"{linear}, {_TIMES_TRANSFER}"), (split.nonlinearity, f"{remainder}, {_TIMES_TRANSFER}")
 
 
 def _columns(term: Term | None, masks: Masks) -> Results:

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from lowfc.contract.configuration import Configuration
     from lowfc.programs.measure.latency.run import LatencyOptions
 
-_RATE_HZ = 1000.0
-_LEAK = 0.01
+_RATE_HZ = 1000.0  # frame rate if none is configured
+_LEAK = 0.01  # of all modes with prepared frames
 
 Kernels = Literal["numpy", "fused", "both"]
 Camera = Literal["prepared", "simulated"]

@@ -48,7 +48,7 @@ RATIOS = {"ratio": ("step_us", ""), "ratio_hot": ("hot_step_us", ", timed back t
 
 For each name of a ratio: the name of the step's duration in `REFERENCES`, and the end of the ratio's label.
 """
-RATIOS_AT = ("p50", "p99")
+RATIOS_AT = ("p50", "p99")  # percentiles
 COUNTS = {
     "frames": "frames",
     "frames_without_command": "without a command",

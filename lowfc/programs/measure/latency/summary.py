@@ -10,7 +10,7 @@ from lowfc.programs.measure.latency import stalls
 from lowfc.programs.measure.latency.frame_statistics import COUNTS, RATIOS, RATIOS_AT, REFERENCES, edges_us
 
 RATIO_ROW = "over_echo_and_step"
-COMPARED = ("p50", "p99", "p99_9")
+COMPARED = ("p50", "p99", "p99_9")  # percentiles
 
 Repeats = Sequence[Mapping[str, Any]]
 
