@@ -10,7 +10,7 @@ from lowfc.programs.console import panels
 
 _LINES = 200  # largest number of lines that are kept
 _REPEAT_S = 10.0
-"""An event that repeats another within this time, apart from numbers, is shown once, with its count."""
+"""An event that differs only in numbers from another within this time is shown once, with its count."""
 _SEARCHED = 8  # number of last lines that are searched for a repeated event
 _DIGITS = re.compile(r"\d+")
 

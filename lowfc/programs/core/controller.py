@@ -118,7 +118,7 @@ class Controller:
         service.awaited = lambda: "" if self._state.frame_sequence else "a camera"
 
     def run(self) -> None:
-        """Do all work except the steps: the receiving thread makes them, the first one excepted, under `_lock`."""
+        """Do all work but steps, which the receiving thread makes once the mirror is known; `_lock` serialises both."""
         self._service.state = "ready"  # from here on the service manager expects a watchdog signal, which `beat` sends
         self._camera.await_first()
         self._adopt_mirror()

@@ -75,7 +75,7 @@ def sim_loop(
         prepare(config, run, console)
         children += children_of(config, run, duration_s, record)
         if show is not None:
-            children.insert(len(children) - record, _view(run, show, console))  # the recorder is stopped after it
+            children.insert(len(children) - record, _view(run, show, console))  # a recorder is stopped after it
         for child in children:
             child.start()
         _supervise(config, children, watch, console, duration_s)

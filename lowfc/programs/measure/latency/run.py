@@ -178,7 +178,7 @@ def _children(options: LatencyOptions, run: Run) -> list[Child]:
     if options.view:
         arguments = ["-m", "lowfc", "view", "--run", run.run_id, "--web"]
         view = program(str(Role.VIEWER), arguments, run.path / f"{Role.VIEWER}.stderr")
-        children.insert(len(children) - options.record, view)  # the recorder is stopped after it
+        children.insert(len(children) - options.record, view)  # a recorder is stopped after it
     if not options.simulated:
         waits = [argument for child in children[1:] for argument in ("--wait-for", child.name)]
         arguments = ["-m", "lowfc.programs.measure.frame_source", *_options(run), "--seconds", str(seconds), *waits]
