@@ -17,7 +17,7 @@ from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.messages import EVENT, FRAME, Role, topic_of, wire
 from lowfc.contract.sequence_gaps import Gaps
 from lowfc.control.loop.safety import mode_name
-from lowfc.programs.launch.sim_loop import check, deferred_signals
+from lowfc.programs.launch.sim_loop import deferred_signals, raise_if_died
 from lowfc.programs.launch.watch import topic_count
 from lowfc.programs.reliability.chaos.bench import ChaosBench
 from lowfc.programs.reliability.chaos.processes import CommandTimes
@@ -75,7 +75,7 @@ class _Soak:
     def sample(self, now_s: float) -> None:
         """Sample processes and latency `now_s` seconds after the start, and check finished logs."""
         children = list(self.bench.children.values())
-        check(children)
+        raise_if_died(children)
         for child in children:
             assert child.process is not None  # noqa: S101  # it was started
             with contextlib.suppress(psutil.Error):  # the process has just ended: the next check raises
