@@ -28,8 +28,8 @@ class _Request(ABC):
         merit: Figure of merit to optimise: paper, table3, table4, condition, throughput, pareto or contrast.
         estimator: pinv, or weighted for the Cramer-Rao bound.
         modes: Modes in Table 3 and the condition number: 14 or 20.
-        weight: Weight w, 0 to 1. pareto minimises table3^(1 - w) table4^w. paper minimises the largest ratio to the
-            paper's values; the ratios in Table 3 have the exponent 2 w, the ratio in Table 4 has 2 (1 - w).
+        weight: Weight w, 0 to 1. The merit pareto is table3^(1 - w) table4^w. The merit paper is the largest ratio of a
+            prediction to the paper's value; ratios in Table 3 have the exponent 2 w, that in Table 4 has 2 (1 - w).
             Default: 0.5.
     """
 

@@ -17,14 +17,14 @@ class Search:
         merit: Figure of merit to optimise: paper, table3, table4, condition, throughput, pareto or contrast.
         estimator: pinv, or weighted for the Cramer-Rao bound. Default: weighted; pinv for the merit paper.
         modes: Modes in Table 3 and the condition number: 14 or 20.
-        weight: Weight w, 0 to 1. pareto minimises table3^(1 - w) table4^w. paper minimises the largest ratio to the
-            paper's values; the ratios in Table 3 have the exponent 2 w, the ratio in Table 4 has 2 (1 - w). Default:
-            0.5; with pareto, each chain has its own weight, from 0 to 1 along a front.
+        weight: Weight w, 0 to 1. The merit pareto is table3^(1 - w) table4^w. The merit paper is the largest ratio of a
+            prediction to the paper's value; ratios in Table 3 have the exponent 2 w, that in Table 4 has 2 (1 - w).
+            Default: 0.5; with pareto, each chain has its own weight, from 0 to 1 along a front.
         focal_mask: disk, bowtie or both. Default: disk; both for the merit paper.
         holes: Number of holes, or FEWEST:MOST.
         diameter: Diameter of the holes, or SMALLEST:LARGEST, in pupil diameters.
         gap: Least distance between the rims of two holes, in pupil diameters.
-        edge: Least distance from a hole to the pupil's edge, in pupil diameters.
+        edge: Least distance from a hole's rim to the pupil's edge, in pupil diameters.
         symmetry: none, or the axis of a mirror symmetry: x or y.
         seed: Seed of all random numbers.
         chains: Number of independent searches: the best is used; along a front, each has its own weight.

@@ -143,7 +143,7 @@ class Prepared:
     ) -> Fit:
         """A linear estimator of the first modes, at the central wavelength or over the band.
 
-        `scale_e` is the electrons of the open circle's light, `kind` one of `KINDS`.
+        `scale_e` is the open circle's light in electrons, `kind` is one of `KINDS`.
         """
         if in_band:
             I0, H = self.band_I0, self.band_tilt_H if modes <= 2 else self.band_H
@@ -152,11 +152,11 @@ class Prepared:
         with self._fitting(modes):
             return fit(I0, H[:, :modes], scale_e, read_noise_e, kind, nuisance)
 
-    def loop_fit(self, I0: Array, H: Array, light_e: float, read_noise_e: float) -> tuple[Array, Array]:
-        """Normalised I0 (pixels,) and weighted R (modes, pixels) of a loop; `light_e` is the open circle's light."""
+    def loop_fit(self, I0: Array, H: Array, scale_e: float, read_noise_e: float) -> tuple[Array, Array]:
+        """Normalised I0 (pixels,) and weighted R (modes, pixels) of a loop; `scale_e` as in `fit`, in electrons."""
         good = np.ones(I0.size)
         I0_normalised, H_normalised = normalise_flux(I0, H, good)
-        flux_e = light_e * float(I0.sum())
+        flux_e = scale_e * float(I0.sum())
         with self._fitting(H.shape[1]):
             return I0_normalised, reconstructor(I0_normalised, H_normalised, good, flux_e, read_noise_e)
 

@@ -29,7 +29,7 @@ _MAX_ATTACHMENT_BYTES = 1 << 28
 def record(run: Run, config: Configuration, calibration: Path | None, shared: bytes | None = None) -> Summary:
     """Record a run until SIGTERM or SIGINT; the configuration and the calibration (FITS) are attached to each log.
 
-    `shared` (TOML) becomes the run's configuration, for other processes, once the recorder has joined.
+    `shared` (TOML) is written to the run's directory, for other processes, once the recorder has joined.
 
     Raises:
         BusError: another recorder is recording this run.
