@@ -92,12 +92,12 @@ def loop_latency(size: Size, rate_hz: float, seconds: float) -> Result:
     `cpu`: processor time of the controller for each frame.
     """
     try:
-        with sampled_processes() as moments, prepared_run(size, config := configuration(size, rate_hz)) as run:
+        with sampled_processes() as samples, prepared_run(size, config := configuration(size, rate_hz)) as run:
             (measured,) = run_repeats(LatencyOptions(config, seconds, 1), run, lambda _: None)
     except LowfcError as fault:
         return {"failure": str(fault)}
     latency_us = {name: measured["latency_us"]["frame_to_command"][name] for name in ("p50", "p99")}
-    used = shares(moments, WARM_UP_S + seconds)
+    used = shares(samples, WARM_UP_S + seconds)
     if "controller" in used:
         latency_us["cpu"] = used["controller"]["share"] * 1e6 / measured["rate_hz"]
     return {

@@ -22,10 +22,10 @@ from lowfc.programs.measure.frame_source import FRAMES_FILE
 from lowfc.programs.measure.latency.run import prepared
 
 FRAMES = 8
-"""Different frames of each size."""
+"""Number of different frames for each size."""
 
-_LIGHT_DN = 1000.0  # mean of a pixel
-_LEAK = 0.01  # the frames do not depend on the mirror: without a leak, noise would accumulate
+_LIGHT_DN = 1000.0  # mean light of a pixel
+_LEAK = 0.01  # the frames do not depend on the mirror: without a leak, their noise would accumulate in the command
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,9 +100,9 @@ def random_calibration(size: Size, config: Configuration) -> tuple[Calibration, 
 
 
 def prepared_run(size: Size, config: Configuration) -> AbstractContextManager[Run]:
-    """A run of a loop of this size, with the files that its processes read; the run is removed afterwards."""
+    """A run of a loop of this size, with the files that its processes read; the end of the `with` block removes it."""
 
-    def fill(config: Configuration, run: Run) -> None:
+    def write_files(config: Configuration, run: Run) -> None:
         calibration, frames = random_calibration(size, config)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", VerifyWarning)  # with hundreds of modes a card's comment is truncated
@@ -110,7 +110,7 @@ def prepared_run(size: Size, config: Configuration) -> AbstractContextManager[Ru
         (run.path / "config.toml").write_text(config.to_toml(), encoding="utf-8")
         np.save(run.path / FRAMES_FILE, frames)
 
-    return prepared(config, fill)
+    return prepared(config, write_files)
 
 
 def _random(rng: np.random.Generator, shape: tuple[int, int], scale: float) -> Single:

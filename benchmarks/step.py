@@ -42,14 +42,14 @@ STAGES: dict[str, tuple[Any, str]] = {
     "limits": (stepping, "limit"),
     "encode": (codec, "encode_command"),
 }
-"""Stages of the step: the owner and the name of the function that is timed."""
+"""Stages of the step: for each, the function that is timed, as its owner (module or class) and its name."""
 REMAINDER, STEP, PRODUCT = "modes to actuators, state, step message", "the whole step", "one product R x"
-_WARM_UP = 200
-_TRACED = 1000
+_WARM_UP = 200  # steps before memory is measured, and again while it is traced
+_TRACED = 1000  # steps whose memory is measured
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """Add the duration."""
+    """Add the option for the duration."""
     add_times(parser, seconds=5.0)
 
 
@@ -75,14 +75,14 @@ def measure(options: argparse.Namespace, report: Report) -> Result:
 
 
 def allocated(step: ControlStep, payloads: Payloads) -> dict[str, float]:
-    """Memory of a step after warm-up, bytes: peak, mean retained, and the size of a float32 frame."""
+    """Memory allocated by a step after warm-up, bytes: peak, mean retained; and the size of a float32 frame."""
     for number in range(_WARM_UP):
         step(payloads.at(number, number))
     tracemalloc.start()
     try:
         for number in range(_WARM_UP):
             step(payloads.at(number, number))
-        begun, highest = tracemalloc.get_traced_memory()[0], 0
+        retained_before, highest = tracemalloc.get_traced_memory()[0], 0
         for number in range(_TRACED):
             payload = payloads.at(number, number)
             tracemalloc.reset_peak()
@@ -90,24 +90,24 @@ def allocated(step: ControlStep, payloads: Payloads) -> dict[str, float]:
             step(payload)
             highest = max(highest, tracemalloc.get_traced_memory()[1] - before)
         del payload  # the last frame must not count as memory retained by the step
-        kept = (tracemalloc.get_traced_memory()[0] - begun) / _TRACED
+        retained = (tracemalloc.get_traced_memory()[0] - retained_before) / _TRACED
     finally:
         tracemalloc.stop()
     rows, columns = payloads.shape
-    return {"peak_bytes": float(highest), "kept_bytes": kept, "frame_bytes": 4.0 * rows * columns}
+    return {"peak_bytes": float(highest), "kept_bytes": retained, "frame_bytes": 4.0 * rows * columns}
 
 
 def tables(found: Result) -> list[Lines]:
-    """A row for each stage."""
+    """A table with a row for each stage, the whole step and the product."""
     columns = [(name, at) for name in ("hot_us", "paced_us") for at in ("p50", "p99")]
-    how = {"hot_us": "back to back", "paced_us": f"at {found['rate_hz']:g} Hz"}
-    head = ["stage, us", *(f"{how[name]}: {at}" for name, at in columns)]
+    conditions = {"hot_us": "back to back", "paced_us": f"at {found['rate_hz']:g} Hz"}
+    head = ["stage, us", *(f"{conditions[name]}: {at}" for name, at in columns)]
     stages = (*STAGES, REMAINDER, STEP, PRODUCT)
     return [[head, *([stage, *(f"{found[name][stage][at]:.1f}" for name, at in columns)] for stage in stages)]]
 
 
 def about(found: Result) -> str:
-    """The step relative to one product, and its memory."""
+    """Duration of the step relative to one product, its size, and the memory that it allocates."""
     ratios, memory, size = found["over_product"], found["memory"], Size()
     return (
         f"The step takes {ratios['hot_us']:.1f} times as long as one product back to back, "

@@ -1,8 +1,8 @@
-"""The loop of the comparison in pyrtcao, each component a process with the arguments in `benchmarks.peers.shared`.
+"""The compared loop in pyrtcao: each component is a process with the arguments listed in `benchmarks.peers.shared`.
 
-Stock: a `WavefrontSensor`, a custom component that computes the signal from the pixels, `Loop.leaky_integrator`, and
-a `WavefrontCorrector`, which converts modes to actuators. Fused: one custom component between sensor and corrector
-computes the whole step in one compiled function, the fastest arrangement that pyrtcao permits.
+Stock arrangement: a `WavefrontSensor`, a custom component that computes the signal from the pixels,
+`Loop.leaky_integrator`, and a `WavefrontCorrector`, which converts modes to actuators. Fused arrangement: one custom
+component between sensor and corrector computes the whole step in one compiled function, as fast as pyrtcao permits.
 
 This module runs in an interpreter with pyrtcao, and imports nothing of lowfc. Under normal scheduling pyrtcao itself
 sets nice -20, if permitted.
@@ -34,21 +34,21 @@ _STREAMS = ("wfs_raw", "wfs", "signal", "wfc")
 class Sensor(WavefrontSensor):
     """Publishes the frames at their scheduled times."""
 
-    part: RoleProcess
+    role_process: RoleProcess
 
     def run(self) -> None:
         """Publish all frames of a run, then end the process."""
-        run_data, published = RunData(self.part.folder), self.part.time_stamps("published")
-        for number in self.part.frame_numbers():
+        run_data, published = RunData(self.role_process.folder), self.role_process.time_stamps("published")
+        for number in self.role_process.frame_numbers():
             self.data = run_data.frame(number)
             published[number] = time.monotonic_ns()
             self.expose()  # pyrtcao numbers frames from 1, too
-        clear(self.part)
+        clear(self.role_process)
         os._exit(0)
 
 
 class PixelSignal(Component):
-    """The signal: pixels minus reference image."""
+    """Component that computes the signal: pixels minus reference image."""
 
     def __init__(self, conf: dict[str, Any], run_data: RunData) -> None:
         super().__init__(conf)
@@ -60,14 +60,14 @@ class PixelSignal(Component):
         self.register_output_stream("signal", create_stream(self.output_stream_name("signal"), (PIXELS,), np.float32))
 
     def compute_signal(self) -> None:
-        """Process one frame."""
+        """Read a frame and publish its signal."""
         image = self.read_stream("wfs", out=self._image)
         np.subtract(image, self._reference, out=self._signal, dtype=np.float32, casting="unsafe")
         self.write_stream("signal", self._signal.reshape(-1))
 
 
 class StockLoop(Loop):
-    """pyrtcao's loop; records when each command was sent."""
+    """pyrtcao's loop, which also records the time at which each command was sent."""
 
     commanded: memoryview
 
@@ -78,7 +78,7 @@ class StockLoop(Loop):
 
 
 class FusedLoop(Component):
-    """The whole step from frame to actuators."""
+    """Component that computes the whole step from frame to actuator values."""
 
     def __init__(self, conf: dict[str, Any], run_data: RunData, commanded: memoryview) -> None:
         super().__init__(conf)
@@ -93,7 +93,7 @@ class FusedLoop(Component):
         _fused(np.zeros(PIXELS, np.int32), *self._arrays, self._difference, self._command.copy())  # compiled here
 
     def step(self) -> None:
-        """Process one frame."""
+        """Read a frame and publish its actuator values."""
         image = self.read_stream("wfs", out=self._image).reshape(-1)
         self.write_stream("wfc", _fused(image, *self._arrays, self._difference, self._command))
         self._commanded[self.frame_id] = time.monotonic_ns()
@@ -114,76 +114,76 @@ def _fused(
 
 
 class StockMirror(WavefrontCorrector):
-    """pyrtcao's corrector without hardware; records when the actuators arrived."""
+    """pyrtcao's corrector without hardware; it records when the actuator values of each command arrived."""
 
     received: memoryview
     last: Array
 
     def shape(self) -> Array:
-        """Actuators of the next command."""
+        """Actuator values of the next command, computed from its modes."""
         super().send_to_hardware()
         actuators: Array = self.current_shape
         return actuators
 
     def send_to_hardware(self) -> None:
-        """Record when the actuators arrived."""
+        """Record the actuator values of the next command and their time of arrival."""
         actuators = self.shape()
         self.received[self.frame_id] = time.monotonic_ns()
         self.last[:] = actuators
 
 
 class FusedMirror(StockMirror):
-    """A corrector that receives actuators."""
+    """A corrector that receives actuator values instead of modes."""
 
     def shape(self) -> Array:
-        """Actuators of the next command, as received."""
+        """Actuator values of the next command, as received."""
         actuators: Array = self.read_stream("wfc", out=self._wfc_buffer)
         return actuators
 
 
-def clear(part: RoleProcess) -> None:
+def clear(role_process: RoleProcess) -> None:
     """Remove a run's streams from shared memory."""
-    clear_shms([_name(part, stream) for stream in _STREAMS])
+    clear_shms([_name(role_process, stream) for stream in _STREAMS])
 
 
-def _name(part: RoleProcess, stream: str) -> str:
-    return f"{part.folder.name}_{stream}"
+def _name(role_process: RoleProcess, stream: str) -> str:
+    return f"{role_process.folder.name}_{stream}"
 
 
-def _configuration(part: RoleProcess, function: str) -> dict[str, Any]:
-    streams = {stream: _name(part, stream) for stream in _STREAMS}
+def _configuration(role_process: RoleProcess, function: str) -> dict[str, Any]:
+    streams = {stream: _name(role_process, stream) for stream in _STREAMS}
     return {
-        "affinity": part.cpu,
-        "realtime_priority": part.priority,
+        "affinity": role_process.cpu,
+        "realtime_priority": role_process.priority,
         "functions": [function],
         "input_streams": streams,
         "output_streams": streams,
     }
 
 
-def _component(part: RoleProcess) -> Component:
-    run_data = RunData(part.folder)
-    if part.role == "source":
-        sensor = Sensor(_configuration(part, "run") | {"name": "wfs", "width": SIDE, "height": SIDE})
-        sensor.part = part
+def _component(role_process: RoleProcess) -> Component:
+    run_data = RunData(role_process.folder)
+    if role_process.role == "source":
+        sensor = Sensor(_configuration(role_process, "run") | {"name": "wfs", "width": SIDE, "height": SIDE})
+        sensor.role_process = role_process
         return sensor
-    if part.role == "signal":
-        return PixelSignal(_configuration(part, "compute_signal"), run_data)
-    if part.role == "fused":
-        return FusedLoop(_configuration(part, "step"), run_data, part.time_stamps("commanded"))
-    if part.role == "loop":
-        loop = StockLoop(_configuration(part, "leaky_integrator") | {"leaky_gain": LEAK})
+    if role_process.role == "signal":
+        return PixelSignal(_configuration(role_process, "compute_signal"), run_data)
+    if role_process.role == "fused":
+        return FusedLoop(_configuration(role_process, "step"), run_data, role_process.time_stamps("commanded"))
+    if role_process.role == "loop":
+        loop = StockLoop(_configuration(role_process, "leaky_integrator") | {"leaky_gain": LEAK})
         loop.cm = run_data.R.copy()
         loop.gain = GAIN
-        loop.commanded = part.time_stamps("commanded")
+        loop.commanded = role_process.time_stamps("commanded")
         return loop
-    fused = part.role == "mirror"
-    matrix = part.folder / "m2c.npy"
+    fused = role_process.role == "mirror"
+    matrix = role_process.folder / "m2c.npy"
     np.save(matrix, np.eye(ACTUATORS, dtype=np.float32) if fused else run_data.to_actuators)
     own_options = {"name": "wfc", "num_actuators": ACTUATORS, "m2c_file": str(matrix)}
     own_options["num_modes"] = ACTUATORS if fused else MODES
-    corrector = (FusedMirror if fused else StockMirror)(_configuration(part, "send_to_hardware") | own_options)
-    corrector.received, corrector.last = part.time_stamps("received"), part.last_actuators()
+    corrector = (FusedMirror if fused else StockMirror)(_configuration(role_process, "send_to_hardware") | own_options)
+    corrector.received, corrector.last = role_process.time_stamps("received"), role_process.last_actuators()
     return corrector
 
 
@@ -196,6 +196,6 @@ if __name__ == "__main__":
     own.reduce_jitter()
     component = _component(own)
     component.start()
-    if own.role != "source":  # the source reports ready in `frame_numbers`
+    if own.role != "source":  # the source reports in `frame_numbers` that it is ready
         own.ready()
     threading.Event().wait()

@@ -264,19 +264,19 @@ def test_a_run_of_a_failed_command_has_the_error_of_the_command() -> None:
 # Use of processors and memory
 
 
-def moment(at_s: float, **used_s: float) -> load.Moment:
-    return load.Moment(at_s, {role: load.Used(one, "0", 2_000_000) for role, one in used_s.items()})
+def sample(at_s: float, **used_s: float) -> load.Sample:
+    return load.Sample(at_s, {role: load.Usage(one, "0", 2_000_000) for role, one in used_s.items()})
 
 
 def test_shares_of_processors_are_averaged_over_the_time_in_which_all_processes_ran() -> None:
-    moments = [moment(0.0, camera=5.0)]
-    moments += [moment(1 + tenth / 10, camera=9 + tenth / 20, controller=1, mirror=tenth / 40) for tenth in range(12)]
-    moments += [moment(3.0, camera=99.0)]
-    found = load.shares(moments, 1.0)
+    samples = [sample(0.0, camera=5.0)]
+    samples += [sample(1 + tenth / 10, camera=9 + tenth / 20, controller=1, mirror=tenth / 40) for tenth in range(12)]
+    samples += [sample(3.0, camera=99.0)]
+    found = load.shares(samples, 1.0)
     assert found["camera"] == {"share": pytest.approx(0.5), "processors": "0", "mb": 2.0}
     assert found["controller"]["share"] == 0
     assert found["mirror"]["share"] == pytest.approx(0.25)
-    assert load.shares(moments[:3], 1.0) == load.shares([], 1.0) == {}
+    assert load.shares(samples[:3], 1.0) == load.shares([], 1.0) == {}
 
 
 def test_roles_of_processes_are_found_from_their_command_lines() -> None:
