@@ -139,10 +139,10 @@ class Faults:
     """Counts exceptions of handlers, and unreadable messages.
 
     The first exception at each place is printed on standard error with its traceback. Unreadable messages are only
-    counted; `take_unreadable` returns and resets their numbers.
+    counted; `take_unreadable` returns and resets the counts.
 
     Attributes:
-        counts: number of exceptions, by place.
+        counts: number of exceptions, by place and key.
         unreadable: number of unreadable messages and the last reason, by key.
     """
 
@@ -152,18 +152,18 @@ class Faults:
         self._lock = threading.Lock()
 
     def add(self, place: str, key: str, fault: Exception) -> None:
-        """Count an unreadable message of topic `key`, or another fault at `place`, such as "camera: handler of"."""
+        """Count an unreadable message of `key`, or an exception at `place` (as in "camera: handler of") and `key`."""
         if isinstance(fault, UNREADABLE):
             self.add_unreadable(key, fault)
             return
-        where = f"{place} {key}"
+        location = f"{place} {key}"
         with self._lock:
-            before = self.counts.get(where, 0)
-            self.counts[where] = before + 1
-        if not before:
+            previous = self.counts.get(location, 0)
+            self.counts[location] = previous + 1
+        if not previous:
             text = "".join(traceback.format_exception(fault))
             with contextlib.suppress(OSError):  # for example a full disk: the receive thread must go on
-                sys.stderr.write(f"{where}: {text}(further exceptions at this place are only counted)\n")
+                sys.stderr.write(f"{location}: {text}(further exceptions at this place are only counted)\n")
 
     def add_unreadable(self, key: str, why: object) -> None:
         """Count an unreadable message by its key or key expression."""
@@ -172,7 +172,7 @@ class Faults:
             self.unreadable[key] = count + 1, why
 
     def take_unreadable(self) -> dict[str, tuple[int, object]]:
-        """Return and reset the number of unreadable messages and the last reason, by key."""
+        """Return the number of unreadable messages and the last reason, by key, and reset them."""
         with self._lock:
             unreadable, self.unreadable = self.unreadable, {}
         return unreadable

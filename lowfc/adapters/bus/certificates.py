@@ -36,7 +36,7 @@ def make_certificates(
     Args:
         folder: folder of the authority; created with access for this user only.
         roles: roles to make certificates for, including the router's.
-        addresses: names and IP addresses by which other hosts reach the router; empty: those in its last certificate.
+        addresses: names and IP addresses by which others reach the router; if empty, `renew` keeps the present ones.
         days: validity of the certificates, days.
         renew: also renew existing certificates, with their present keys; the authority is never renewed.
 
@@ -51,24 +51,24 @@ def make_certificates(
     """
     names = [_general_name(address) for address in addresses]
     try:
-        missing = [role for role in roles if renew or not (folder / f"{role}.pem").exists()]
+        to_make = [role for role in roles if renew or not (folder / f"{role}.pem").exists()]
         if renew and not names and (folder / f"{ROUTER}.pem").exists():
             names = _router_addresses(folder)
-        if ROUTER in missing and not names:
+        if ROUTER in to_make and not names:
             raise ConfigurationError(
                 "the router's certificate needs the router's address: give with --router the name by which other "
                 "hosts reach it"
             )
         if renew and not (folder / CA).exists():
             raise ConfigurationError(f"{folder} has no authority whose certificates could be renewed")
-        if ROUTER not in missing and (lacking := [n.value for n in names if n not in _router_addresses(folder)]):
+        if ROUTER not in to_make and (uncovered := [n.value for n in names if n not in _router_addresses(folder)]):
             raise ConfigurationError(
-                f"the router's certificate is not for {', '.join(map(str, lacking))}: renew it "
+                f"the router's certificate is not for {', '.join(map(str, uncovered))}: renew it "
                 "(--renew), with --router for each of its addresses"
             )
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         key, authority = _authority(folder)
-        for role in missing:
+        for role in to_make:
             role_key = _role_key(folder, role)
             usage = ExtendedKeyUsageOID.SERVER_AUTH if role == ROUTER else ExtendedKeyUsageOID.CLIENT_AUTH
             builder = _builder(role, role_key, days).issuer_name(authority.subject)
@@ -78,11 +78,11 @@ def make_certificates(
             write_whole(folder / f"{role}.pem", builder.sign(key, SHA256()).public_bytes(Encoding.PEM))
     except OSError as fault:
         raise DataFileError(f"no certificates can be written in {folder}: {fault.strerror or fault}") from fault
-    return [folder / f"{role}.pem" for role in missing]
+    return [folder / f"{role}.pem" for role in to_make]
 
 
 def _authority(folder: Path) -> tuple[EllipticCurvePrivateKey, x509.Certificate]:
-    """Key and certificate of the authority, made if neither exists."""
+    """Key and certificate of the authority; both are made if neither exists."""
     certificate_file, key_file = folder / CA, folder / CA_KEY
     missing = [file.name for file in (certificate_file, key_file) if not file.exists()]
     if len(missing) == 2:
@@ -170,7 +170,7 @@ def _general_name(address: str) -> x509.GeneralName:
     with contextlib.suppress(ValueError):
         return x509.IPAddress(ipaddress.ip_address(address))
     if not re.fullmatch(r"[A-Za-z0-9.-]+", address):
-        raise ConfigurationError(f"the router's address is a host's name or IP address, without port; got {address!r}")
+        raise ConfigurationError(f"the router's address is a host name or an IP address, without port; got {address!r}")
     return x509.DNSName(address)
 
 

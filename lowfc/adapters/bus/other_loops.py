@@ -15,8 +15,8 @@ from lowfc.adapters.bus.run import runtime_path
 _PROGRAMS = ("controller", "sim-loop")
 _MAX_LISTED = 3
 _MAX_NAME_LENGTH = 48  # characters of a run's name
-_FOLDER = "XDG_RUNTIME_DIR"
-_START_S = 600.0  # longest start: the first one computes the optical model
+_VARIABLE = "XDG_RUNTIME_DIR"
+_START_S = 600.0  # longest duration of a start: the first one computes the optical model
 
 
 def no_loop_message() -> str:
@@ -24,10 +24,10 @@ def no_loop_message() -> str:
     loops = list(other_loops())
     if transient := [text for text, starting in loops if starting]:
         return f"{transient[0]}, which is starting or ending: try again in a few seconds"
-    origin = f"from {_FOLDER}" if os.environ.get(_FOLDER) else f"{_FOLDER} is not set"
+    origin = f"from {_VARIABLE}" if os.environ.get(_VARIABLE) else f"{_VARIABLE} is not set"
     message = (
         f"no loop of user {_user_name(os.geteuid())} is running here: {runtime_path()} was searched ({origin}); loops "
-        f"of other users, or started with another {_FOLDER}, cannot be reached"
+        f"of other users, or started with another {_VARIABLE}, cannot be reached"
     )
     unlisted = [f"and {len(loops) - _MAX_LISTED} more"] if len(loops) > _MAX_LISTED else []
     return "; ".join([message, *(text for text, _ in loops[:_MAX_LISTED]), *unlisted])
@@ -36,8 +36,8 @@ def no_loop_message() -> str:
 def other_loops() -> Iterator[tuple[str, bool]]:
     """Yield a sentence and a flag for each simulated loop and each separate controller on this host, of any user.
 
-    The flag is set for a young process of this user with our runtime directory: as no run was found there, the loop is
-    starting or ending.
+    The flag is set for a process of this user that started less than ten minutes ago with our runtime directory: as no
+    run was found there, the loop is starting or ending.
     """
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):  # it has ended, or is not readable
@@ -45,9 +45,9 @@ def other_loops() -> Iterator[tuple[str, bool]]:
             parent = process.parent() if program else None
             if program and process.pid != os.getpid() and not (parent and _program(parent.cmdline())):
                 owner = process.uids().effective
-                who = "you run" if owner == os.geteuid() else f"user {_user_name(owner)} runs"
-                where, starting = _directory_clause(process, owner)
-                yield f"{who} `{program}` (process {process.pid}){where}", starting
+                subject = "you run" if owner == os.geteuid() else f"user {_user_name(owner)} runs"
+                directory, starting = _directory_clause(process, owner)
+                yield f"{subject} `{program}` (process {process.pid}){directory}", starting
 
 
 def _program(arguments: Sequence[str]) -> str:
@@ -62,18 +62,18 @@ def _program(arguments: Sequence[str]) -> str:
 
 
 def _directory_clause(process: psutil.Process, owner: int) -> tuple[str, bool]:
-    """Clause on a process's runtime directory; whether it is a young process of this user with our runtime directory.
+    """Clause on a process's runtime directory, and the flag of `other_loops`.
 
-    The clause is empty for such a process, and for a process of another user whose environment cannot be read.
+    The clause is empty if the flag is set, and for a process whose environment cannot be read.
     """
     try:
-        folder = process.environ().get(_FOLDER, "")
+        folder = process.environ().get(_VARIABLE, "")
     except psutil.Error:
         return "", False
-    if owner == os.geteuid() and folder == os.environ.get(_FOLDER, ""):
+    if owner == os.geteuid() and folder == os.environ.get(_VARIABLE, ""):
         starting = time.time() - process.create_time() < _START_S
         return "" if starting else ", but its directory is gone, as after a logout: stop and restart it", starting
-    return f", with {_FOLDER}={folder}" if folder else f", without {_FOLDER}", False
+    return f", with {_VARIABLE}={folder}" if folder else f", without {_VARIABLE}", False
 
 
 def _user_name(user: int) -> str:

@@ -1,7 +1,7 @@
 """A run: one loop's runtime directory, ports and secret, so that two loops on one host never mix.
 
-The first process fills the directory under another name, then renames it; all others read it. It belongs to the user
-(mode 0700), and is under $XDG_RUNTIME_DIR, or under /tmp if that variable is not set.
+The first process fills the directory under another name, then renames it; all others read it. The directory belongs
+to the user (mode 0700), and is under $XDG_RUNTIME_DIR, or under /tmp if that variable is not set.
 """
 
 import contextlib
@@ -167,8 +167,8 @@ def open_run(
         base: parent of its directory; the user's runtime directory when None.
         listeners: additional roles with a port, if this call creates the run: a launcher must listen to receive from a
             viewer, which only connects.
-        network: router of the run, if this call creates the run. An existing run must have the same router, unless
-            `network` has none, or a launcher created the run: a launcher's runs stay on one host.
+        network: router and certificates of the run, if this call creates it. An existing run must have the same ones,
+            unless `network` has no router, or a launcher created the run: a launcher's runs stay on one host.
 
     Raises:
         BusError: the name is invalid; the run exists without one of `mirrors`, or with another network; `mirrors` is
@@ -274,14 +274,14 @@ def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...], netw
     """Create the directory under another name and rename it; if another process was first, its directory is used."""
     # Monitors connect and do not listen: there may be several, and no other process connects to them.
     roles = [Role.CAMERA, Role.CONTROLLER, *map(mirror_role, mirrors), Role.RECORDER, *listeners]
-    taken = set[int]()  # ports of other runs: on a shared port, a killed run would seem live and could not listen again
+    used = set[int]()  # ports of other runs: on a shared port, a killed run would seem live and could not listen again
     for other in path.parent.glob(f"*/{_LINKS}"):
         with contextlib.suppress(DataFileError):
-            taken |= set(_read(other.parent).ports.values())
+            used |= set(_read(other.parent).ports.values())
     links = {
         "run_id": path.name,
         "user": _USER,
-        "ports": dict(zip(map(str, roles), free_ports(len(roles), taken), strict=True)),
+        "ports": dict(zip(map(str, roles), free_ports(len(roles), used), strict=True)),
         **({"network": network.model_dump()} if network.router else {}),
     }
     draft = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))  # mode 0700
@@ -311,14 +311,14 @@ def _read(path: Path) -> Links:
         ) from fault
 
 
-def free_ports(count: int, taken: AbstractSet[int] = frozenset()) -> list[int]:
-    """Return free loopback TCP ports below the host's ephemeral range and not in `taken`; BusError if too few are free.
+def free_ports(count: int, excluded: AbstractSet[int] = frozenset()) -> list[int]:
+    """Return free loopback TCP ports below the ephemeral range and not in `excluded`; BusError if too few are free.
 
     An outgoing connection could take an ephemeral port before the role listens on it. A repeated attempt to connect to
     an ephemeral port without a listener could get this port on its own side, and connect to itself. If the ephemeral
     range begins at 15000 or below, the kernel chooses ports within it.
     """
-    candidates = sorted({*range(_LOWEST_PORT, int(_PORT_RANGE.read_text().split()[0]))} - taken)
+    candidates = sorted({*range(_LOWEST_PORT, int(_PORT_RANGE.read_text().split()[0]))} - excluded)
     chooser = random.SystemRandom()
     with contextlib.ExitStack() as sockets:
         ports: list[int] = []

@@ -1,4 +1,4 @@
-"""Refusal of sequences whose start is too far in the future: later valid sequences would seem out of order."""
+"""Refusal of sequences whose start is too far in the future: after one of these, valid ones would seem out of order."""
 
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -27,8 +27,8 @@ class StartCheck:
         self._first_refused = 0
 
     def ahead(self, sequence: int) -> bool:
-        """Whether the start in this sequence is too far ahead."""
-        if sequence < self._first_refused or not self._enabled:  # time only increases, and this bound with it
+        """Whether the start in this sequence is too far ahead of the clock."""
+        if sequence < self._first_refused or not self._enabled:  # this bound only increases, as time does
             return False
         now_s = self._clock.host_ns() // _NS
         self._first_refused = sequence_of(now_s + self._ahead_s + 1, 0)

@@ -8,16 +8,16 @@ import zenoh
 
 from lowfc.contract.errors import BusError
 
-_LONGEST = 200  # characters
-_PLACE = re.compile(r"\s*\bat /?\S+\.rs:\d+\.?")
+_MAX_LENGTH = 200  # characters
+_SOURCE_LOCATION = re.compile(r"\s*\bat /?\S+\.rs:\d+\.?")
 
 
 def cause_of(fault: zenoh.ZError) -> str:
     """Cause of an error, without zenoh's source locations and component names."""
-    text = _PLACE.sub("", str(fault).partition("\n")[0]).strip(" .")
+    text = _SOURCE_LOCATION.sub("", str(fault).partition("\n")[0]).strip(" .")
     if text.endswith("]") and ": [" in text:  # ": [cause]" at the end; an IPv6 address may end in "]", too
         text = text[:-1].rpartition(": [")[2]
-    return text[:_LONGEST]
+    return text[:_MAX_LENGTH]
 
 
 @contextmanager
