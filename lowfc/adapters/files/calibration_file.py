@@ -12,7 +12,7 @@ from lowfc.control.loop.camera import CameraSettings
 
 KIND = "lowfc calibration 1"
 
-# Extension, attribute of Calibration, unit, description.
+# Name of the extension, attribute of Calibration, unit, description.
 _EXTENSIONS = (
     ("REFERENCE", "reference", "", "reference image I0, fraction of the flux"),
     ("RESPONSE", "response", "nm-1", "response matrix H, fraction of the flux per nm rms of wavefront"),
@@ -64,12 +64,12 @@ def to_bytes(calibration: Calibration) -> bytes:
 
 
 def save(calibration: Calibration, path: Path) -> None:
-    """Write a FITS file; DataFileError if that fails."""
+    """Write a calibration to a FITS file; DataFileError if that fails."""
     write_whole(path, to_bytes(calibration))
 
 
 def load(path: Path, content: bytes | None = None) -> Calibration:
-    """Read a FITS file, or its `content` if given (`path` is then only named in errors), and check its identity.
+    """Read a calibration from a FITS file, or from its `content` (`path` then serves only errors); check its identity.
 
     Raises:
         DataFileError: the file is missing or damaged, or is of another kind.

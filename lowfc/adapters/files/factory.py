@@ -52,7 +52,7 @@ def sensor(config: Configuration, warn: Callable[[str], None]) -> Sensor:
 
 
 def band(config: Configuration) -> Band:
-    """Sample wavelengths of the star's band, with weights."""
+    """Wavelengths that sample the star's band, with their weights."""
     if config.sensor.wavelengths == 1:
         return monochromatic(config.star.wavelength_nm)
     quadrature = gauss_legendre if config.sensor.quadrature == "gauss-legendre" else uniform
@@ -71,13 +71,13 @@ def twin(config: Configuration, progress: Progress | None, warn: Callable[[str],
 
 
 def contrast_of(config: Configuration) -> ModalContrast:
-    """Contrast that the modes add in the dark zone, from the cache or computed in 0.3 s (2 s with a Lyot stop)."""
+    """Contrast that the modes add to the dark zone, from the cache or computed in 0.3 s (2 s with a Lyot stop)."""
     optics = coronagraph_from(config.sensor), config.noll, config.star.wavelength_nm
     return ModalContrast(*optics, load_or_compute_form(*optics))
 
 
 def contrast_or_none(config: Configuration | None) -> ModalContrast | None:
-    """Result of `contrast_of` for a log or running loop; None without `config`; a warning and None if it fails."""
+    """Result of `contrast_of` for a log or running loop; None without `config` or, with a warning, if it fails."""
     try:
         return None if config is None else contrast_of(config)
     except LowfcError as error:
@@ -156,7 +156,7 @@ def settings(config: Configuration) -> Settings:
         auto_gain=(control.tilt_gain == "auto", control.gain == "auto"),
         leak=(control.tilt_leak, control.leak),
         limit_nm=(control.tilt_limit_nm, control.limit_nm),
-        # Without noise, images of a working camera are identical.
+        # Without simulated noise, images of a working camera may be identical.
         max_identical_frames=control.max_identical_frames if config.camera.noise else 0,
         rate_hz=config.camera.rate_hz,
         guard=control.guard,
@@ -172,21 +172,21 @@ def _interlock(section: InterlockSection) -> Interlock:
 def analytic_calibration(
     config: Configuration, optics: Twin, on_nodes: TwinMirror, opd_nm: Array | None = None
 ) -> Calibration:
-    """Calibration from the sensor's digital twin: I0 and H (the paper's eqs. 6 to 12), R, and the mirror's modes.
+    """Calibration from the sensor's digital twin: I0 and H (the paper's eqs. (6) to (12)), R, and modes to actuators.
 
     The modes are fitted with the influence functions, then mixed slightly so that the sensor measures each modal
-    command exactly: through the shaped pupil, the mirror's print-through looks like low-order modes of up to 0.3 % of
+    command as itself: through the shaped pupil, the mirror's print-through looks like low-order modes of up to 0.3 % of
     the command. No mode moves an inactive actuator, and the sensor's response to these actuators is set to 0.
 
     Args:
         config: Configuration of the instrument.
         optics: Digital twin of the instrument's sensor.
         on_nodes: Wavefront of the nominal mirror at the twin's nodes.
-        opd_nm: Wavefront at the twin's used nodes at which I0 and H are computed; flat when None.
+        opd_nm: (used nodes,) wavefront for which I0 and H are computed, at the twin's used nodes; flat when None.
 
     Raises:
-        CalibrationError: the sensor cannot distinguish the modes, gets no light or is saturated, or shear is a fitted
-            nuisance at a wavefront that is not flat.
+        CalibrationError: the sensor cannot distinguish the modes, gets no light or is saturated; or shear is a fitted
+            nuisance and `opd_nm` is given.
         ConfigurationError: the map of active actuators cannot be used, or there are fewer actuators than modes.
     """
     if opd_nm is not None and "shear" in config.control.nuisance:
@@ -246,27 +246,27 @@ def analytic_calibration(
 def actuators_to_modes(
     reconstructor: Array, reference: Array, good: Array, optics: Twin, on_nodes: TwinMirror, opd_nm: Array | None = None
 ) -> Array:
-    """Matrix Z (modes, actuators): nm of wavefront that R measures per nm of surface of each actuator.
+    """Matrix (modes, actuators) of the nm rms of wavefront that R measures per nm of surface of each actuator.
 
     Args:
         reconstructor: (modes, pixels) R, nm per flux fraction.
-        reference: (pixels,) I0 of the twin.
+        reference: (pixels,) I0 of the twin, not divided by its flux.
         good: (pixels,) 1 for a used pixel, else 0.
         optics: Digital twin of the sensor.
         on_nodes: Wavefront of the mirror at the twin's nodes.
-        opd_nm: Wavefront at the twin's used nodes at which R was computed; flat when None.
+        opd_nm: (used nodes,) wavefront for which R was computed, at the twin's used nodes; flat when None.
     """
     sensed = projected_response(optics, for_unnormalised_images(reconstructor, reference, good), opd_nm)
     return np.asarray(sensed @ poke_wavefronts_nm(on_nodes))
 
 
 def frame_noise_nm(config: Configuration, calibration: Calibration) -> Array:
-    """Standard deviation of each mode's noise per frame, nm rms of wavefront: photon and read noise through R."""
+    """Standard deviation (modes,) of the noise of each mode in one frame, nm of wavefront, from `frame_noise_nm2`."""
     return np.asarray(np.sqrt(np.diag(frame_noise_nm2(config, calibration))))
 
 
 def frame_noise_nm2(config: Configuration, calibration: Calibration) -> Array:
-    """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront, including the rounding to whole DN."""
+    """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront: photons, read-out and rounding, through R."""
     camera = detector(config)
     flux_e = calibration.flux_dn * camera.gain_e_per_dn / camera.em_gain
     reference, matrix = calibration.reference.astype(float), calibration.reconstructor.astype(float)
@@ -294,7 +294,7 @@ def _check_exposure(config: Configuration, light: Array) -> None:
 
 
 def _nuisance(config: Configuration, light: Array, good: Array) -> Array | None:
-    """Slope of the normalised image (pixels, parameters) for each fitted nuisance parameter; None without any."""
+    """Change of the normalised image (pixels, parameters) per unit of each nuisance parameter; None without any."""
     columns = [
         np.ones((light.size, 1)) if name == "background" else shear_slopes(config) for name in config.control.nuisance
     ]

@@ -1,4 +1,4 @@
-"""Maps of the mirror in FITS or .npy files: shapes, and the map of active actuators."""
+"""Maps of the mirror from FITS or .npy files: shapes, and the map of active actuators."""
 
 from pathlib import Path
 

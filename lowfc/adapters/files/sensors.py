@@ -1,4 +1,4 @@
-"""Load pupils from files; build sensors and coronagraphs from their section of the configuration."""
+"""Load pupils from files; build sensors and coronagraphs from the section [sensor] of the configuration."""
 
 import contextlib
 import json
@@ -45,7 +45,7 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
 
     Raises:
         DataFileError: The file is missing or damaged, holds no quadrant, or one that transmits beyond the circle.
-        ConfigurationError: `samples` is not such a multiple.
+        ConfigurationError: `samples` is not a multiple of twice the quadrant's samples.
     """
     with _opened(file) as arrays:
         quarter = np.asarray(arrays["quarter"])
@@ -54,9 +54,9 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
         corner = np.arange(cells)  # coordinate of each cell's corner nearest to the centre, cells
         beyond = quarter[corner[:, None] ** 2 + corner**2 >= cells**2]
         if beyond.any():
-            found = f"up to {float(beyond.max()):g} in {counted(int(np.count_nonzero(beyond)), 'cell')}"
+            excess = f"up to {float(beyond.max()):g} in {counted(int(np.count_nonzero(beyond)), 'cell')}"
             raise ValueError(
-                f"`quarter` must be 0 beyond the pupil's circle, with a radius of {cells} cells, got {found}: "
+                f"`quarter` must be 0 beyond the pupil's circle, with a radius of {cells} cells, got {excess}: "
                 "set these to 0, or scale the opening down"
             )
     with raised_as(ConfigurationError, ValueError, file):
@@ -79,7 +79,7 @@ def load_dark_zone(file: Traversable) -> Wedge:
                 raise ValueError(f"the outer radius must be at most {SAMPLES // 2} lambda/D, got {zone.outer:g}")
             if not zone.is_sampled:
                 raise ValueError("the dark zone is too thin for a science image of two samples per lambda/D")
-        except Exception as error:  # anything may be stored here
+        except Exception as error:  # `made_by` may hold anything
             raise DataFileError(
                 f"{file}: `made_by` must be the request of `lowfc design spc`, a text with `inner`, `outer` and "
                 f"`half_angle_deg` of its dark zone, or be omitted: {error!r}"
@@ -138,7 +138,7 @@ def sensor_from(
 
 
 def sensor_named(name: str) -> Sensor:
-    """Build one of `SENSORS`, or the sparse-aperture sensor with that layout."""
+    """Build the sensor of this name in `SENSORS`, or the sparse-aperture sensor with the layout of this name."""
     return sensor_from(SensorSection.model_validate(sensor_keys(name)))
 
 
