@@ -15,7 +15,7 @@ _SEARCH_S = 1.0
 """Period of the search for channels that appeared."""
 _ATTEMPTS = 3
 _CREATION_S = 0.02
-"""Time in which another program finishes creating a stream."""
+"""Time for which an unfinished stream is waited for: another program may be creating it."""
 _POLL_S = 0.001
 
 
@@ -26,7 +26,7 @@ def sum_name(channel: str) -> str:
 
 
 def other_channel_names(channel: str) -> tuple[str, ...]:
-    """Names of the other channels of the same mirror."""
+    """Names of the other channels of the same mirror; empty if the channel's name is not CACAO's."""
     total = sum_name(channel)
     return tuple(name for name in (f"{total}{index:02d}" for index in range(CHANNELS)) if total and name != channel)
 
@@ -57,12 +57,12 @@ class OtherChannels:
 
     @property
     def unusable(self) -> list[str]:
-        """The reason for each existing channel that is left out."""
+        """A text for each existing channel that is left out, with the reason."""
         not_finite = [stream.name for stream, shape in self._shapes.items() if shape is None]
         return self._misfits + [f"stream {name!r} has values that are not finite" for name in not_finite]
 
     def sum(self) -> Single:
-        """Sum of the channels (rows, columns); the same array object until one is written, appears or disappears."""
+        """Sum of the channels (rows, columns); the same array object until a channel is written, appears or ends."""
         now_s = time.monotonic()
         current = {path: stream for path, stream in self._streams.items() if stream.current()}
         if len(current) < len(self._streams) or now_s - self._searched_s >= _SEARCH_S:
@@ -88,7 +88,7 @@ class OtherChannels:
 
 
 def opened(path: Path, grid: tuple[int, int]) -> Stream:
-    """Open a stream of a mirror's shapes; StreamError if there is none, or it has another grid or layout."""
+    """Open a stream of shapes of this grid (rows, columns); StreamError if there is none, or it has another layout."""
     stream = Stream(path)
     if not fits(stream, grid):
         planes, rows, columns = stream.layout.shape
@@ -108,7 +108,7 @@ def fits(stream: Stream, grid: tuple[int, int]) -> bool:
 def complete_shape(stream: Stream, otherwise: Single | None = None) -> Single | None:
     """Copy the shape in a stream; None if it is not finite.
 
-    While the stream is being written, or if its writer died meanwhile, the shape is `otherwise`.
+    While the stream is being written, or if its writer died meanwhile, `otherwise` is the result (None if not finite).
     """
     for _ in range(_ATTEMPTS):
         count, shape = stream.count, stream.data[0].astype(np.float32)

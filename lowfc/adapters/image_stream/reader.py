@@ -9,15 +9,15 @@ import numpy.typing as npt
 
 from lowfc.adapters.image_stream.stream import Stream, StreamAbsentError, StreamError, alive
 
-_CHECK_S = 0.1
-_ABSENT_CHECK_S = 0.005
+_CHECK_S = 0.1  # period of checks whether the stream was recreated
+_ABSENT_CHECK_S = 0.005  # the same while there is no stream
 _ATTEMPTS = 3
 
 
 class StreamImage(NamedTuple):
-    """Copy of an image (rows, columns), its number in the stream, and the stream's `generation`, both counted from 1.
+    """Copy of an image (rows, columns), its number in the stream, and the `generation` of that stream, both from 1.
 
-    `acquired_ns` is the acquisition time stated by its writer, ns since the epoch.
+    `acquired_ns` is the acquisition time that its writer stated, ns since the epoch.
     """
 
     pixels: npt.NDArray[np.generic]
@@ -44,7 +44,7 @@ class StreamReader:
         self._open()
 
     def next(self, timeout_s: float) -> StreamImage | None:
-        """Newest image not yet returned; None if none arrived in time. StreamError as for the constructor."""
+        """Newest image, waited for if none is new; None after the timeout. StreamError as for the constructor."""
         end_s = time.monotonic() + timeout_s
         mapped = self._open()
         while True:
@@ -60,7 +60,7 @@ class StreamReader:
             mapped = self._open()
 
     def silence_cause(self) -> str:
-        """Reason for the missing images, as far as the stream shows it."""
+        """Reason why no image comes, as far as the stream shows it."""
         stream = self.stream
         if stream is None or not stream.current():
             return f"there is no stream {self._path.name.removesuffix('.im.shm')!r}"
@@ -76,7 +76,7 @@ class StreamReader:
         self.stream = None
 
     def _open(self) -> bool:
-        """Map the present stream of that name if necessary; return whether one is mapped."""
+        """Map the stream at the path unless the mapped one is current; return whether one is mapped."""
         if self.stream is not None and self.stream.current():
             return True
         self.stream = None
@@ -97,7 +97,7 @@ class StreamReader:
         return True
 
     def _image(self) -> StreamImage | None:
-        """Newest image if it is complete and new; its writer posts the semaphore once it is complete."""
+        """Newest image; None unless it is complete and new. Its writer posts the semaphore once it is complete."""
         stream = self.stream
         assert stream is not None  # noqa: S101
         for _ in range(_ATTEMPTS):

@@ -11,7 +11,7 @@ MAX_VALUE = 10
 """Value at which a semaphore is no longer posted: its reader is behind or absent."""
 
 _LIBC = ctypes.CDLL(None, use_errno=True)
-_FIXED = slice(8, 12)  # bytes that contain a semaphore's sharing mode, which no operation changes
+_SHARING_MODE = slice(8, 12)  # bytes of a semaphore that no operation changes
 
 
 class _TimeSpec(ctypes.Structure):
@@ -40,15 +40,17 @@ class Semaphores:
         _LIBC.sem_init(fresh, 1, 0)
         memory = self._memory.raw
         starts = range(0, len(memory), SEMAPHORE_BYTES)
-        return all(memory[start : start + SEMAPHORE_BYTES][_FIXED] == fresh.raw[_FIXED] for start in starts)
+        return all(
+            memory[start : start + SEMAPHORE_BYTES][_SHARING_MODE] == fresh.raw[_SHARING_MODE] for start in starts
+        )
 
     def value(self, index: int) -> int:
-        """Value of a semaphore: posts not yet consumed."""
+        """Value of a semaphore: number of posts not yet consumed."""
         _LIBC.sem_getvalue(self._addresses[index], ctypes.byref(self._value))
         return self._value.value
 
     def wait(self, index: int, timeout_s: float) -> bool:
-        """Wait for a post; False after the timeout or a signal."""
+        """Wait for a post and consume it; False after the timeout or a signal."""
         end_ns = time.monotonic_ns() + int(timeout_s * 1e9)
         self._end.seconds, self._end.nanoseconds = divmod(end_ns, 1_000_000_000)
         return bool(_LIBC.sem_clockwait(self._addresses[index], time.CLOCK_MONOTONIC, ctypes.byref(self._end)) == 0)

@@ -28,15 +28,15 @@ from lowfc.adapters.image_stream.semaphores import Semaphores
 from lowfc.contract.errors import LowfcError
 
 SEMAPHORES = 10
-"""Number of semaphores of a stream created here; this and the numbers below are those of the C library."""
-TRACES = 10
+"""Number of semaphores of a stream created here; this number and those below are the C library's."""
+TRACES = 10  # number of records of accesses by processes
 _MAX_NAME_BYTES = 79
 _MODE = 0o666
 _NS = 1_000_000_000
 
 
 class StreamError(LowfcError):
-    """A stream that cannot be used."""
+    """A stream cannot be used."""
 
 
 class StreamAbsentError(StreamError):
@@ -54,7 +54,7 @@ def stream_path(name: str) -> Path:
 
 
 class Newest(NamedTuple):
-    """Header fields of the newest image: its `atime`, number of images written, and plane.
+    """Header fields of the newest image: its `atime` (two fields), number of images written so far, and its plane.
 
     `writing` is set while an image is being written, and stays set if its writer dies meanwhile.
     """
@@ -75,12 +75,12 @@ class Stream:
     """A stream of images in shared memory.
 
     Attributes:
-        layout: positions of its parts, as declared in its header when opened.
+        layout: positions of the stream's parts, as declared in its header when it was opened.
         data: (planes, rows, columns) view of the pixels.
         semaphores: semaphores, one for each reader.
         readers: (semaphores,) view of the id of the process that waits for each semaphore; 0 or less for none.
         writers: (semaphores,) view of the id of the process that last posted each semaphore.
-        identity: identity of the file, which differs for another file of the same name.
+        identity: device, inode and size of the file; they differ for another file of the same name.
     """
 
     def __init__(self, path: Path) -> None:
@@ -114,7 +114,7 @@ class Stream:
         starts, count = layout.starts, layout.semaphores
         self.data = np.ndarray(layout.shape, layout.dtype, self._mapping, starts["data"])
         self.semaphores = Semaphores(self._mapping, starts["semaphores"], count)
-        self._log = Semaphores(self._mapping, starts["log"], 1)
+        self._log_semaphore = Semaphores(self._mapping, starts["log"], 1)
         self.readers = np.ndarray(count, "<i4", self._mapping, starts["readers"])
         self.writers = np.ndarray(count, "<i4", self._mapping, starts["writers"])
         self._cnt0, self._write = self._header["cnt0"], self._header["write"]
@@ -208,9 +208,10 @@ class Stream:
         pid = os.getpid()
         for index in self.semaphores.post_all():
             self.writers[index] = pid
-        self._log.post_all()
+        self._log_semaphore.post_all()
 
     def _put_in_ring(self) -> None:
+        """Copy the image to the next place of the circular buffer."""
         after = int(self._header["ring_index"][0]) + 1
         index = after if after < self.layout.ring else 0
         image = self.data.reshape(-1).view(np.uint8)
