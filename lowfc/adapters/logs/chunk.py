@@ -10,18 +10,18 @@ import lz4.frame
 import zstandard
 
 MAX_BYTES = 1 << 28
-"""Largest size of a record, compressed or not: a damaged length must not use up the memory."""
+"""Largest accepted size of a record, compressed or not: a damaged length must not use up the memory."""
 
-CHUNK_HERE = re.compile(
+CHUNK_START = re.compile(
     rb"\x06(?=.{36}(?:\x03\x00{3}lz4.{8}\x04\x22\x4d\x18|\x04\x00{3}zstd.{8}\x28\xb5\x2f\xfd|\x00{4}.{8}[\x03-\x05].{4}\x00{4}))",
     re.DOTALL,
 )
 """Pattern that finds a chunk: its opcode, its head with a supported compression, and the start of its content."""
 
-_FIXED = struct.Struct("<QQQII")  # times of first and last message, decompressed size, its CRC, length of the name
-_COMPRESSED = struct.Struct("<Q")
+_HEAD = struct.Struct("<QQQII")  # times of first and last message; size and CRC when decompressed; length of a name
+_COMPRESSED_SIZE = struct.Struct("<Q")  # after the name of the compression
 _RECORD_HEAD_BYTES = 9  # opcode and length
-_MAX_NAME_LENGTH = 40
+_MAX_NAME_LENGTH = 40  # of an unsupported compression, in an error
 
 
 class UnsoundError(Exception):
@@ -42,7 +42,7 @@ class Chunk(NamedTuple):
     Attributes:
         position: first byte of the chunk in the file.
         length: size of the chunk in the file, bytes.
-        crc: checksum of `content`.
+        crc: CRC-32 of `content`.
         content: concatenated records.
     """
 
@@ -57,7 +57,7 @@ def _zstd(data: memoryview, size: int) -> bytes:
         return stream.read(size)
 
 
-# Decompressor of each compression, and the largest ratio of sizes that its format allows (zstd: any).
+# Decompressor of each compression, and the largest ratio of decompressed to compressed size (zstd: any).
 _COMPRESSIONS: dict[bytes, tuple[Callable[[memoryview, int], bytes], int]] = {
     b"lz4": (lambda data, size: lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size), 255),
     b"zstd": (_zstd, MAX_BYTES),
@@ -65,12 +65,12 @@ _COMPRESSIONS: dict[bytes, tuple[Callable[[memoryview, int], bytes], int]] = {
 }
 
 
-def read_chunk(body: bytes, at: int, *, may_lack_crc: bool = False) -> Chunk:
+def read_chunk(body: bytes, position: int, *, may_lack_crc: bool = False) -> Chunk:
     """Decompress and check a chunk.
 
     Args:
         body: record of the chunk, without opcode and length.
-        at: position of the record in the file.
+        position: position of the record in the file, bytes.
         may_lack_crc: whether to accept a chunk without a checksum.
 
     Raises:
@@ -78,14 +78,14 @@ def read_chunk(body: bytes, at: int, *, may_lack_crc: bool = False) -> Chunk:
         CompressionError: its compression is not supported.
     """
     try:
-        _, _, size, crc, name_length = _FIXED.unpack_from(body)
-        (compressed,) = _COMPRESSED.unpack_from(body, _FIXED.size + name_length)
+        _, _, size, crc, name_length = _HEAD.unpack_from(body)
+        (compressed,) = _COMPRESSED_SIZE.unpack_from(body, _HEAD.size + name_length)
     except struct.error as fault:
         raise UnsoundError("a chunk is too short") from fault
-    begin = _FIXED.size + name_length + _COMPRESSED.size
+    begin = _HEAD.size + name_length + _COMPRESSED_SIZE.size
     if compressed != len(body) - begin:
         raise UnsoundError("the head of a chunk is damaged")
-    name = body[_FIXED.size : _FIXED.size + name_length]
+    name = body[_HEAD.size : _HEAD.size + name_length]
     if name not in _COMPRESSIONS:
         raise CompressionError(name[:_MAX_NAME_LENGTH].decode(errors="backslashreplace"))
     decompress, largest_ratio = _COMPRESSIONS[name]
@@ -98,4 +98,4 @@ def read_chunk(body: bytes, at: int, *, may_lack_crc: bool = False) -> Chunk:
     computed = zlib.crc32(content)
     if computed != crc and not (may_lack_crc and crc == 0 and len(content) == size):
         raise UnsoundError("the checksum of a chunk is wrong")
-    return Chunk(at, _RECORD_HEAD_BYTES + len(body), computed, content)
+    return Chunk(position, _RECORD_HEAD_BYTES + len(body), computed, content)

@@ -18,7 +18,7 @@ from lowfc.contract.printable import encodable
 
 
 class LogCopy:
-    """A new log to which files are copied in turn.
+    """A new log, to which the files of other logs are copied in turn.
 
     Attributes:
         messages: number of messages written so far.
@@ -32,7 +32,7 @@ class LogCopy:
         self._writer = begun_writer(file)
 
     def add_metadata(self, name: str, entries: dict[str, str]) -> None:
-        """Add metadata."""
+        """Write a metadata record."""
         self._writer.add_metadata(name, {key: encodable(value) for key, value in entries.items()})
 
     def add_file(
@@ -98,7 +98,7 @@ class LogCopy:
 
 
 def refuse_existing(path: Path) -> None:
-    """Raise DataFileError if the file to which a log is to be written exists already."""
+    """Raise DataFileError if the file to be written exists already: a log is never overwritten."""
     if os.access(path, os.F_OK):
         raise DataFileError(f"{path} already exists; a log is never overwritten; name another one with --out")
 

@@ -28,29 +28,29 @@ Parts = tuple[Path, ...]
 LogFiles = Path | Sequence[Path]
 """A log to read: its file, or its files in order."""
 
-_NAMED = re.compile(r"(\d{8}T\d{6}Z)(?:-(\d+))?(-[a-z].*)?\.mcap(\.part)?", re.ASCII)
+_LOG_NAME = re.compile(r"(\d{8}T\d{6}Z)(?:-(\d+))?(-[a-z].*)?\.mcap(\.part)?", re.ASCII)
 
 
 class Repeated:
-    """Detects messages that a file of a log repeats at its start from the file before: calibrations and states.
+    """Detects messages that a file of a log repeats at its start from earlier files, such as calibrations and states.
 
     Two lockstep runs may have the same sequences, so times of publication are compared too.
     """
 
     def __init__(self) -> None:
         self._newest: dict[tuple[str, int], tuple[int, int]] = {}
-        self._before: dict[tuple[str, int], tuple[int, int]] = {}
+        self._earlier: dict[tuple[str, int], tuple[int, int]] = {}
 
     def next_file(self) -> None:
         """Begin the next file."""
-        self._before = dict(self._newest)
+        self._earlier = dict(self._newest)
 
     def __call__(self, message: Sample) -> bool:
-        """Whether this message was in a previous file."""
+        """Whether this message was in an earlier file."""
         with contextlib.suppress(KeyError):
             if topic_of(message.key).queryable:
                 publisher = message.key, start_of(message.sequence)  # a topic may have several publishers
-                sequence, publish_ns = self._before.get(publisher, (-1, -1))
+                sequence, publish_ns = self._earlier.get(publisher, (-1, -1))
                 if message.sequence <= sequence and message.publish_time_ns <= publish_ns:
                     return True
                 newest = message.sequence, message.publish_time_ns
@@ -132,11 +132,11 @@ def named_logs(names: Sequence[Path], out: Path | None = None, *, as_json: bool 
 
     Raises:
         ConfigurationError: several logs are named for a single output, or a part is named twice.
-        DataFileError: the folder contains no log.
+        DataFileError: `last` is named, and the folder contains no log.
     """
     logs: dict[tuple[str, ...], dict[int, Path]] = {}
     for path in _files(names):
-        alone = [path] == list(names)  # the only file named: its place in a recording does not matter
+        alone = [path] == list(names)  # the only file named: its number in a recording does not matter
         key, number = ((), 1) if alone else _recording_and_number(path)
         parts = logs.setdefault(key or (str(path.absolute()),), {})
         if number in parts:
@@ -152,7 +152,7 @@ def named_log(names: Sequence[Path]) -> Parts:
 
     Raises:
         ConfigurationError: several logs are named.
-        DataFileError: the folder contains no log.
+        DataFileError: `last` is named, and the folder contains no log.
     """
     logs = named_logs(names)
     if len(logs) > 1:
@@ -168,7 +168,7 @@ def named_files(names: Sequence[Path], out: Path | None = None, *, as_json: bool
 
 
 def titled(paths: Parts) -> str:
-    """Short name of a log's files."""
+    """Short text that names the files of a log."""
     return str(paths[0]) if len(paths) == 1 else f"{paths[0]} to {paths[-1].name} ({len(paths)} files)"
 
 
@@ -211,10 +211,10 @@ def _files(names: Sequence[Path]) -> Iterator[Path]:
 
 
 def _newest(folder: Path) -> list[Path]:
-    """Files of the newest log of a folder, in order; the newest is found by its name, which begins with the time."""
+    """Files of the newest log of a folder, in order; the newest log has the latest time in its name."""
     hint = f"the newest log of another folder is FOLDER/{LAST}"
     try:
-        files = {path: match for path in folder.iterdir() if (match := _NAMED.fullmatch(path.name))}
+        files = {path: match for path in folder.iterdir() if (match := _LOG_NAME.fullmatch(path.name))}
     except OSError as fault:
         raise DataFileError(
             f"`{LAST}` is the newest log in {folder}, which cannot be read: {fault.strerror}; {hint}"
@@ -245,7 +245,7 @@ def _recording_and_number(path: Path) -> tuple[tuple[str, ...], int]:
     except DataFileError:
         return (), 1  # reading the file raises this again
     entries = metadata.get(PART, {})
-    number, of = entries.get("number", ""), entries.get("of", "")
-    if not of or not re.fullmatch("[1-9][0-9]{0,8}", number):
+    number, recording = entries.get("number", ""), entries.get("of", "")
+    if not recording or not re.fullmatch("[1-9][0-9]{0,8}", number):
         return (), 1
-    return (metadata.get("lowfc", {}).get("run", ""), of), int(number)
+    return (metadata.get("lowfc", {}).get("run", ""), recording), int(number)

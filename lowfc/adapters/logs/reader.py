@@ -59,7 +59,7 @@ class LogReader:
             progress: called at intervals with the bytes read and their total.
             topics: topics whose messages are delivered; None: all.
             skip_damaged: whether to leave out damaged stretches instead of raising an error.
-            from_ns: log time; chunks known to end before it are skipped.
+            from_ns: log time, ns; chunks known to end before it are skipped.
             always: topics exempt from `from_ns`: a chunk with a message of any of them is read, with all its messages.
             sparse: whether to skip chunks without messages of `topics`, by their indexes: for topics with few messages
                 in a long log. The checksums of skipped chunks, and then of the data section, are not checked.
@@ -133,7 +133,7 @@ class LogReader:
             raise DataFileError(f"{self.path} is not an MCAP file")
 
     def _needs(self, end_ns: int, channels: Collection[int]) -> bool:
-        """Whether a chunk with these channels is needed; an undeclared channel may be declared in the chunk."""
+        """Whether to read a chunk with these channels that ends at `end_ns`; it may declare a channel that is unknown."""
         if any(number not in self._delivered for number in channels):
             return True
         if end_ns < self._from_ns:
@@ -142,7 +142,7 @@ class LogReader:
         return not self._sparse or any(self._delivered[number] for number in channels)
 
     def _chunk(self, chunk: Chunk) -> list[Sample]:
-        """Messages of a chunk; a repeated or inconsistent chunk is left out."""
+        """Messages of a chunk; none of a repeated or inconsistent chunk, which counts as damage."""
         identity = hash((chunk.crc, chunk.content[:_PREFIX_BYTES]))
         try:
             if identity in self._chunks:
@@ -162,7 +162,7 @@ class LogReader:
         return messages
 
     def _messages(self, content: bytes) -> list[Sample]:
-        """Decode a chunk's messages of the selected topics, store its declarations; UnsoundError if inconsistent."""
+        """Decode a chunk's messages of the selected topics and store its declarations; UnsoundError if inconsistent."""
         samples: list[Sample] = []
         delivered, at, end = self._delivered, 0, len(content)
         read_head, read_message, make_sample = HEAD.unpack_from, _MESSAGE_HEAD.unpack_from, Sample._make

@@ -22,7 +22,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, ChunkIndex, Header, Metadata, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from lowfc.adapters.logs.chunk import CHUNK_HERE, MAX_BYTES, Chunk, CompressionError, UnsoundError, read_chunk
+from lowfc.adapters.logs.chunk import CHUNK_START, MAX_BYTES, Chunk, CompressionError, UnsoundError, read_chunk
 from lowfc.adapters.logs.writer import UNFINISHED
 from lowfc.contract.codecs import input_file
 from lowfc.contract.errors import DataFileError
@@ -229,7 +229,7 @@ class LogFile:
             self._bytes_to_try -= min(end - at, MAX_BYTES)  # these bytes have been read once already
         start, block = at + 1, _FIRST_BLOCK_BYTES
         while start < self.size and self._bytes_to_try > 0:
-            for match in CHUNK_HERE.finditer(self._read(start, block + 64)):
+            for match in CHUNK_START.finditer(self._read(start, block + 64)):
                 if self._intact_chunk_at(start + match.start()):
                     return start + match.start()
             start, block = start + block, min(2 * block, _BLOCK_BYTES)

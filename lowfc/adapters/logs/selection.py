@@ -46,14 +46,14 @@ class Selection:
 
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Metadata for the start of a log; empty if everything is recorded."""
+        """Metadata record of the selection, for the start of a log; empty if everything is recorded."""
         if self == EVERYTHING:
             return {}
         return {SELECTION: {"every": str(self.interval_frames), "left_out": " ".join(self._keys)}}
 
     @property
     def description(self) -> str:
-        """Description of the selection; empty for everything."""
+        """Description of the selection, in words; empty if everything is recorded."""
         names = [name for topic, name in _DECIMATED.items() if topic not in self.excluded]
         parts = [f"1 in {self.interval_frames} {' and '.join(names)}"] if self.interval_frames > 1 and names else []
         parts += [f"without {', '.join(self._keys)}"] if self.excluded else []
@@ -100,7 +100,7 @@ def selection(interval_frames: int = 1, patterns: Iterable[str] = ()) -> Selecti
     """Make a selection from options.
 
     Args:
-        interval_frames: N to record every Nth frame and mirror state.
+        interval_frames: N, if every Nth frame and mirror state is recorded.
         patterns: keys or shell patterns of the optional topics to record; empty: all.
 
     Raises:

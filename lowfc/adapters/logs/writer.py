@@ -40,9 +40,9 @@ UNFINISHED = ".part"
 FILE_MODE = 0o640
 """Default permissions of a log, further reduced by the umask: notes and frames are not public."""
 
-CHUNK_BYTES = (
-    240 * 1024
-)  # the message that exceeds this ends the chunk, which stays below 256 KiB if frames have up to 15
+CHUNK_BYTES = 240 * 1024
+"""The message that exceeds this size ends the chunk; if it has up to 15 KiB, the chunk stays below 256 KiB."""
+
 PART = "part"
 """Name of the metadata with the recording that a file belongs to, and the file's number in it."""
 
@@ -60,7 +60,7 @@ class Attachment:
 
 
 class _File(FileIO):
-    """File of a log that keeps track of its size and of the longest write."""
+    """File of a log; it keeps track of its size and of the longest call that writes to it."""
 
     def __init__(self, path: Path, mode: int) -> None:
         super().__init__(path, "x", opener=lambda name, flags: os.open(name, flags, mode))
@@ -101,7 +101,7 @@ class LogWriter:
         attachments: Sequence[Attachment] = (),
         file_mode: int = FILE_MODE,
     ) -> None:
-        """Create `path` + ".part" with these permissions, and write metadata and attachments, dated `time_ns`.
+        """Create `path` + ".part" with permissions `file_mode`; write metadata, and attachments dated `time_ns`.
 
         Raises:
             DataFileError: a log of that name exists, or the disk refuses a write.
@@ -134,11 +134,11 @@ class LogWriter:
 
     @property
     def longest_write_ns(self) -> int:
-        """Longest duration of a write, ns."""
+        """Longest duration of a call that writes to the file, ns."""
         return self._raw.longest_write_ns
 
     def write(self, sample: Sample) -> None:
-        """Add a message with its payload unchanged; KeyError if the topic does not exist."""
+        """Add a message with its payload unchanged; KeyError if its key belongs to no topic."""
         try:
             self._writer.add_message(
                 channel_id=self._channel(sample),
@@ -192,7 +192,7 @@ class LogWriter:
             self._writer.add_metadata(name, {key: encodable(value) for key, value in entries.items()})
 
     def _refused(self, fault: OSError) -> DataFileError:
-        """Convert an error of the disk, and truncate the file to complete records."""
+        """Close the log, truncated to complete records, and return the error for a disk that refused a write."""
         self.abandon()
         state = "its content is readable" if self.part.exists() else "the file was removed"
         return DataFileError(
@@ -227,7 +227,7 @@ class LogWriter:
 
 
 def begun_writer(file: IO[bytes]) -> Writer:
-    """Writer of an MCAP file with all checksums, which has written the file's header."""
+    """Writer of an MCAP file with all checksums; the file's header is already written."""
     writer = Writer(
         file, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4, enable_crcs=True, enable_data_crcs=True
     )
@@ -266,7 +266,7 @@ def log_path(folder: Path, time_ns: int) -> Path:
 
 
 def declaration(message: type[ProtobufMessage]) -> FileDescriptorSet:
-    """Descriptors of a message's file and its imports, imports first, as readers require."""
+    """Descriptors of the .proto file that declares a message and of its imports, imports first, as readers require."""
     declared = FileDescriptorSet()
     added: set[str] = set()
 
