@@ -133,7 +133,7 @@ class LogReader:
             raise DataFileError(f"{self.path} is not an MCAP file")
 
     def _needs(self, end_ns: int, channels: Collection[int]) -> bool:
-        """Whether to read a chunk with these channels that ends at `end_ns`; it may declare a channel that is unknown."""
+        """Whether to read a chunk with these channels that ends at `end_ns`; it may declare an unknown channel."""
         if any(number not in self._delivered for number in channels):
             return True
         if end_ns < self._from_ns:

@@ -1,7 +1,7 @@
 """Offset between two hosts' clocks, from the shortest of recent round trips, as in NTP.
 
-The other clock is read between query and receipt. The estimate assumes that it is read in the middle, so that the error
-is at most half the round trip; the shortest round trip is therefore the best.
+The other clock is read between query and receipt of the answer. The estimate assumes that it is read in the middle, so
+the error is at most half the round trip, and the exchange with the shortest round trip is the best.
 """
 
 import threading
@@ -10,10 +10,10 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 RECENT = 16
-"""Number of compared exchanges: 8 s, in which two clocks drift apart by at most about 0.1 ms."""
+"""Number of compared exchanges: those of 8 s, in which two clocks drift apart by at most about 0.1 ms."""
 FIRST_EXCHANGES = 8
 """Number of exchanges before the first message is sent."""
-PERIOD_S = 0.5
+PERIOD_S = 0.5  # between two exchanges
 
 
 class Exchange(NamedTuple):
@@ -37,10 +37,10 @@ class ClockOffset:
         return 0 if best is None else best.offset_ns
 
     def add_exchange(self, queried_ns: int, other_ns: int, received_ns: int) -> None:
-        """Add one exchange: this host's time at query and receipt, and the other host's time at its answer."""
+        """Add one exchange: this host's times of query and receipt, and the other host's time in its answer."""
         new = Exchange(other_ns - (queried_ns + received_ns) // 2, received_ns - queried_ns)
-        apart_ns = abs(new.offset_ns - self.offset_ns) - 1_000_000  # 1 ms, ten times the drift
-        if self.best is not None and apart_ns > (new.round_trip_ns + self.best.round_trip_ns) // 2:
+        change_ns = abs(new.offset_ns - self.offset_ns) - 1_000_000  # 1 ms, ten times the drift, is allowed
+        if self.best is not None and change_ns > (new.round_trip_ns + self.best.round_trip_ns) // 2:
             self._recent.clear()  # the other clock was set, as after a reboot of its host
         self._recent.append(new)
         self.best = min(self._recent, key=lambda exchange: exchange.round_trip_ns)

@@ -15,9 +15,9 @@ from lowfc.control.kernel import functions
 from lowfc.control.kernel.tables import FUSED, NUMPY, Kernel
 
 FASTMATH = frozenset({"reassoc", "contract"})
-"""Permitted parts of fast-math: NaN and infinity are preserved, and the same binary gives the same bytes."""
+"""Permitted parts of fast-math: they preserve NaN and infinity, and the same binary gives the same bytes."""
 SHARED_BYTES = 8 << 20
-"""Size of R from which threads share a frame; below, waking the threads takes longer than they save."""
+"""Size of R from which threads share a frame; for a smaller R, waking the threads takes longer than they save."""
 
 
 def available() -> bool:
@@ -80,7 +80,7 @@ class Pool:
         totals: Sequences,
         *rest: Any,
     ) -> float:
-        """Same as `lowfc.control.kernel.functions.measure`, with the pass over a large frame shared by the threads."""
+        """Do the same as `lowfc.control.kernel.functions.measure`; the threads share the pass over a large frame."""
         scanned = pixels, good, dark, tiles, scratch, sums_nm, totals
         if tiles.nbytes < SHARED_BYTES:
             return self._measure(*scanned, *rest)
@@ -96,7 +96,7 @@ class Pool:
         self._measure_blocks(pixels, good, dark, tiles, scratch, first, last, sums_nm, totals)
         for _, done in self._locks:
             done.acquire()
-        return self._measure(pixels[:0], *scanned[1:], *rest)  # no pixels: it uses the sums computed above
+        return self._measure(pixels[:0], *scanned[1:], *rest)  # without pixels, it uses the sums computed above
 
     def _share(self, number: int, go: threading.Lock, done: threading.Lock) -> None:
         """Process this thread's share of each frame."""

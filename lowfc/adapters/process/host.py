@@ -19,7 +19,7 @@ import psutil
 CPUS = "sys/devices/system/cpu"
 _STA_UNSYNC, _STA_NANO, _TIME_ERROR = 0x40, 0x2000, 5
 _STAT = Path("/proc/stat")
-_MAX_READ_BYTES = 1 << 14  # of a file; of /proc/stat, counted from the beginning of the processor's line
+_MAX_READ_BYTES = 1 << 14  # read from a file; from /proc/stat, counted from the beginning of the processor's line
 
 
 class Synchronisation(NamedTuple):
@@ -37,7 +37,7 @@ class Host:
         self.root = root
 
     def text(self, path: str) -> str:
-        """Content of a file below `proc` or `sys`."""
+        """Content of a file, whose `path` begins with "proc/" or "sys/"."""
         return (self.root / path).read_text(errors="replace").strip()
 
     def text_or_nothing(self, path: str) -> str:
@@ -61,7 +61,7 @@ class Host:
         return os.sched_getaffinity(0)
 
     def quota_cpus(self) -> float | None:
-        """CPU quota of this process's control group and its parents, in processors; None without a quota."""
+        """Smallest CPU quota of this process's control group and its parents, in processors; None without a quota."""
         lines = self.text("proc/self/cgroup").splitlines()
         (path,) = [line.removeprefix("0::/") for line in lines if line.startswith("0::")]
         groups = [Path(path), *Path(path).parents]
@@ -93,7 +93,7 @@ class Host:
         return os.getloadavg()[0]
 
     def busy(self) -> list[tuple[str, float]]:
-        """Other processes, busiest first: name (pid), and load in processors since the last call."""
+        """Other processes, busiest first: "name (pid)", and load in processors since the last call (0 at the first)."""
         processes = [process.info for process in psutil.process_iter(["pid", "name", "cpu_percent"])]
         loads = [
             (f"{info['name']} ({info['pid']})", (info["cpu_percent"] or 0.0) / 100)
@@ -103,7 +103,7 @@ class Host:
         return sorted(loads, key=lambda load: -load[1])
 
     def disk(self, folder: Path) -> tuple[int, bool]:
-        """Free bytes on the disk of a folder, which may not exist yet, and whether it is writable."""
+        """Free bytes on the disk of a folder, and whether the folder, or its nearest existing parent, is writable."""
         existing = self.root / folder.absolute().relative_to("/")
         while not existing.exists():
             existing = existing.parent
@@ -125,7 +125,7 @@ class Counts(NamedTuple):
     """The kernel's counters of delays of a process, since boot or since the process's start.
 
     Attributes:
-        stolen_ns: time of one processor, or of all, that the hypervisor gave to other guests, in steps of 10 ms.
+        stolen_ns: time of one or of all processors that the hypervisor gave to other guests, in steps of 10 ms.
         throttled: number of periods in which the control group's quota was used up.
         waited_ns: time for which the thread was runnable without a processor.
         preempted: number of involuntary context switches of the thread.
@@ -147,7 +147,7 @@ class Counters:
     def __init__(self, process: int, thread: int, cpus: Collection[int]) -> None:
         """Open the files of a thread; OSError if there is no such thread.
 
-        Stolen time is that of the processor in `cpus`, or of all processors if `cpus` has not exactly one.
+        Stolen time is that of the processor in `cpus`, or of all processors if `cpus` does not have exactly one.
         """
         folder = f"/proc/{process}/task/{thread}"
         self._cpu = f"cpu{next(iter(cpus))} " if len(cpus) == 1 else "cpu "
@@ -187,7 +187,7 @@ def _run_ns(process: int) -> dict[int, int]:
 
 
 def _quota_file() -> Path | None:
-    """File with the throttling counter of this process's control group; None without a quota."""
+    """File with the throttling counter of this process's control group; None if there is none."""
     for line in Path("/proc/self/cgroup").read_text().splitlines():
         _, controllers, path = line.split(":", 2)
         if not controllers or "cpu" in controllers.split(","):
@@ -205,13 +205,13 @@ def resident_bytes(process: int | None = None) -> int:
     """Resident memory of a process (None: this one); psutil.NoSuchProcess if it does not exist."""
     if process is not None:
         return int(psutil.Process(process).memory_info().rss)
-    pages = _content(_own_memory(os.getpid())).split()[1]  # for every Health: several times as fast as psutil
+    pages = _content(_own_memory(os.getpid())).split()[1]  # read for every Health: several times as fast as psutil
     return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
 
 @functools.lru_cache(1)
 def _own_memory(process: int) -> int:
-    """Descriptor of the open file with this process's memory use; the key `process`, its id, differs after a fork."""
+    """Descriptor of the open file with this process's memory use, cached for its id `process`, which a fork changes."""
     return os.open(f"/proc/{process}/statm", os.O_RDONLY)
 
 
@@ -234,5 +234,5 @@ def program_name() -> str:
 
 
 def by_this_process(what: str) -> str:
-    """Text that names this process and its user as the author of an action: `lowfc ctl by ann (process 12)`."""
+    """The text `what`, followed by this process's user and id: `moving the mask by ann (process 12)`."""
     return f"{what} by {psutil.Process().username()} (process {os.getpid()})"

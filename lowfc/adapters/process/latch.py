@@ -1,7 +1,7 @@
-"""The latch of safe mode: files that outlive the controller, in two places that fail independently.
+"""The latch of safe mode: files that outlive the controller, in up to two places that fail independently.
 
-A file in any place means safe, and so does a place that cannot be read. A separate thread writes the files and retries
-until it succeeds, so that neither a full disk nor a hanging file server delays the loop or an answer.
+A file in any place means safe mode, and so does a place that cannot be read. A separate thread writes the files and
+retries until it succeeds, so that neither a full disk nor a hanging file server delays the loop or an answer.
 """
 
 import contextlib
@@ -22,8 +22,8 @@ RETRY_S = 1.0
 def latch_files(run: Run) -> tuple[Path, ...]:
     """Files of a run's latch: one in its directory, one outside that is named after the run.
 
-    The second survives a reboot or logout, which remove the run's directory. A run started by a launcher ends with it
-    and needs the first only.
+    The second survives a reboot or logout, which remove the run's directory. A run that a launcher started ends with
+    the launcher, and needs only the first.
     """
     files = (run.path / NAME,)
     if Role.LAUNCHER in run.links.ports:
@@ -51,7 +51,7 @@ class Latch:
         self._reported: set[Path] = set()
         # Lists, so that every file is tried: `any` and `all` would stop at the first result.
         self.safe = True in [self._exists(file) for file in self._files]
-        self.writable = True in [self._try(_probe, file) for file in self._files]
+        self.writable = True in [self._try(_check_writable, file) for file in self._files]
         self._target = self.safe
         self._stored: bool | None = None if self.safe else False  # None: the files may differ
         self._ended = False
@@ -66,7 +66,7 @@ class Latch:
             self._changed.notify()
 
     def close(self) -> None:
-        """Finish writing: make one more attempt, for up to a second."""
+        """Finish writing: make one more attempt, if necessary, and wait for it for up to a second."""
         with self._changed:
             self._ended = True
             self._changed.notify()
@@ -84,7 +84,7 @@ class Latch:
         return False
 
     def _keep(self) -> None:
-        """Write or remove the files until all agree with the state; runs on its own thread."""
+        """After each change of the state, write or remove the files until all agree with it; runs on its own thread."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._ended or self._target is not self._stored)
@@ -100,9 +100,9 @@ class Latch:
             if ended:
                 return
 
-    def _try(self, act: Callable[[Path], None], file: Path) -> bool:
+    def _try(self, action: Callable[[Path], None], file: Path) -> bool:
         try:
-            act(file)
+            action(file)
         except OSError as fault:
             self._report(file, f"{file} cannot be written ({fault.strerror})")
             return False
@@ -110,7 +110,7 @@ class Latch:
         return True
 
     def _report(self, file: Path, why: str) -> None:
-        """Report a file's fault, again only after the file has worked; a failing handler does not end this thread."""
+        """Report a file's fault, and again only after the file has worked; an exception of the handler is ignored."""
         if file not in self._reported:
             self._reported.add(file)
             with contextlib.suppress(Exception):
@@ -132,6 +132,6 @@ def _remove(file: Path) -> None:
         file.with_name(FORMER_NAME).unlink(missing_ok=True)
 
 
-def _probe(file: Path) -> None:
+def _check_writable(file: Path) -> None:
     with tempfile.TemporaryFile(dir=file.parent):
         pass

@@ -1,4 +1,4 @@
-"""Progress display: bars that disappear at the end; without a terminal, lines."""
+"""Progress display: bars that disappear at the end or, without a terminal, lines."""
 
 import contextlib
 import time
@@ -9,7 +9,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, ProgressColumn, T
 
 ProgressCallback = Callable[[str, int, int], None]
 """Function called with the description of the work, the amount done and the total amount."""
-_EVERY_S = 10.0
+_LINE_PERIOD_S = 10.0
 
 
 def passing_bar(console: Console, *columns: ProgressColumn) -> Progress:
@@ -19,9 +19,9 @@ def passing_bar(console: Console, *columns: ProgressColumn) -> Progress:
 
 @contextlib.contextmanager
 def counting_bar(console: Console, *columns: ProgressColumn) -> Iterator[ProgressCallback]:
-    """One bar for several tasks in turn, with `columns` beside its description; it appears with the first progress.
+    """Yield a callback that shows several tasks in turn in one bar, with `columns`; the bar appears at its first call.
 
-    Without a terminal, lines are printed: see `progress_lines`.
+    Without a terminal, the callback prints lines: see `progress_lines`.
     """
     if not console.is_terminal:
         yield progress_lines(lambda line: console.print(line, markup=False, highlight=False, soft_wrap=True))
@@ -38,12 +38,12 @@ def counting_bar(console: Console, *columns: ProgressColumn) -> Iterator[Progres
 
 
 def percentage_bar(console: Console) -> contextlib.AbstractContextManager[ProgressCallback]:
-    """Make a bar like `counting_bar`, in per cent of the total amount."""
+    """Make a bar like `counting_bar` that shows the amount done in per cent of the total."""
     return counting_bar(console, TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn())
 
 
 def reading_bar(console: Console) -> contextlib.AbstractContextManager[ProgressCallback]:
-    """Make a bar like `counting_bar`, for the bytes read from a file."""
+    """Make a bar like `counting_bar` that shows the bytes read from a file."""
     return counting_bar(console, DownloadColumn(), TimeRemainingColumn())
 
 
@@ -62,7 +62,7 @@ def progress_lines(write: Callable[[str], None], clock: Callable[[], float] = ti
         last = done
         if done == first:  # exclude the time before the first progress from the rate
             begun = now
-        elif now - written >= _EVERY_S:
+        elif now - written >= _LINE_PERIOD_S:
             written = now
             seconds = (now - begun) / (done - first) * (total - done)
             write(f"{what}: {done / total:.0%}, about {seconds:.0f} s to go")

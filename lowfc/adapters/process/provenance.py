@@ -20,7 +20,7 @@ _SIMD = ("sse", "ssse", "avx", "fma", "f16c", "amx", "neon", "asimd", "sve", "fp
 
 
 def provenance(run_id: str = "", seed: int | None = None) -> dict[str, str]:
-    """Versions and host of a run; constant for the same host and installation.
+    """Versions and host of a run: the same for every run of an installation on a host, except for run and seed.
 
     Args:
         run_id: name of the run; empty for none.

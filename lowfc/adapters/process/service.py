@@ -1,4 +1,4 @@
-"""Common tasks of every process of a run: stop at a signal, publish health and events, receive others' health."""
+"""Common tasks of every process of a run: stop at a signal, publish Health and events, receive others' Health."""
 
 import contextlib
 import os
@@ -33,7 +33,7 @@ from lowfc.control.loop.wording import counted
 
 HEALTH_PERIOD_NS = 500_000_000
 WAITING_NS = 2_000_000_000
-"""A ready process that waits longer than this for others reports their names."""
+"""A ready process that announces its state and waits longer than this for others prints their names."""
 PRINTED, PRINTED_NS = 10, 10_000_000_000
 """Largest number of warnings of one kind printed on standard error within this time, ns; all are in the log."""
 WORK: dict[str, str] = {Role.CAMERA: "frame", Role.CONTROLLER: "frame", Role.MIRROR: "command"}
@@ -52,8 +52,8 @@ class Service:
         why: cause of the end, once it is stopped.
         work: number of frames, commands, messages or snapshots processed; `rate_hz` in Health is its rate.
         last_health: newest Health of every other process, by name.
-        announces: whether it prints on standard error that it is ready, and which processes it waits for.
-        awaited: returns the processes it waits for, in words; empty if none.
+        announces: whether it prints on standard error that it is ready or stopped, and which processes it waits for.
+        awaited: function that returns the names of the processes it waits for, as text; empty if none.
     """
 
     def __init__(
@@ -79,8 +79,8 @@ class Service:
             granted: real-time measures requested before the bus was opened.
             at_ready: requests further measures once the process is ready; a refusal (older kernels) gives no event.
             fill: adds the role's own fields to each Health.
-            announces: see the attribute.
-            supervisor: service manager; by default that of the environment.
+            announces: as the attribute.
+            supervisor: service manager; by default the one that the environment names.
         """
         self.name = name
         self.clock = clock
@@ -173,7 +173,7 @@ class Service:
         return self.bus.subscribe(topic, dispatch.put, name or ALL)
 
     def has_newcomers(self) -> bool:
-        """Whether a process has joined or restarted since the last call."""
+        """Whether a process has joined, or one other than a viewer has restarted, since the last call."""
         before, self._known_starts = self._known_starts, dict(self._starts)
         return before != self._known_starts
 
@@ -243,7 +243,7 @@ class Service:
     def event(self, event: str, **details: object) -> None:
         """Publish an event of the table; callable from any thread.
 
-        Errors are also printed on standard error, and warnings, at most `PRINTED` of each kind within `PRINTED_NS`.
+        Errors and warnings are also printed on standard error; of one warning, at most `PRINTED` within `PRINTED_NS`.
         """
         kind = EVENTS[event]
         log = kind.log(self.name, self.clock.now_ns(), **details)
@@ -279,7 +279,7 @@ class Service:
         Set `state` to "ready" before: others may be waiting for this process.
 
         Returns:
-            Names of those that did not answer in time; empty if all did.
+            Names of those that were not ready in time, or when this process was stopped; empty if all were ready.
         """
         awaited = tuple(names)
         deadline_s = time.monotonic() + timeout_s
@@ -294,14 +294,14 @@ class Service:
     def require(self, names: Iterable[str], timeout_s: float, consequence: str) -> None:
         """Wait for these processes as `wait_for` does.
 
-        BusError, with the `consequence`, if one does not answer in time, unless this process has been stopped.
+        BusError, with the `consequence`, if one is not ready in time, unless this process has been stopped.
         """
         missing = self.wait_for(names, timeout_s)
         if missing and self.running:
             raise BusError(f"no sign of {', '.join(missing)} after {timeout_s:g} s; {consequence}")
 
     def health(self) -> wire.Health:
-        """Current Health of the process."""
+        """Present Health of the process."""
         now_ns = self.clock.host_ns()
         message = wire.Health(
             timestamp=timestamp(now_ns),
@@ -351,7 +351,7 @@ class Service:
             return
         self.last_health[name] = health
         start_s = start_of(sample.sequence)
-        # Several viewers may share the name, so that its start alternates.
+        # Several viewers may share their name, so that the start under this name alternates.
         if name not in self._starts or (self._starts[name] != start_s and name != Role.VIEWER):
             self._starts[name] = start_s
             self._due_ns = 0  # publish Health at the next beat, so that a newcomer does not wait for it

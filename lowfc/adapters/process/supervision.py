@@ -34,11 +34,11 @@ class Supervisor:
 
     def ready(self) -> None:
         """Notify that the process is ready."""
-        self._once("READY=1")
+        self._send_once("READY=1")
 
     def stopping(self) -> None:
         """Notify that the process is stopping."""
-        self._once("STOPPING=1")
+        self._send_once("STOPPING=1")
 
     def alive(self, now_ns: int) -> None:
         """Send the watchdog signal if due; to be called only on the thread that does the process's work."""
@@ -51,22 +51,22 @@ class Supervisor:
         if self._address:
             self._send(f"STATUS={status_line(health)}")
 
-    def _once(self, what: str) -> None:
-        if what not in self._sent:
-            self._sent.add(what)
-            self._send(what)
+    def _send_once(self, notification: str) -> None:
+        if notification not in self._sent:
+            self._sent.add(notification)
+            self._send(notification)
 
-    def _send(self, what: str) -> None:
+    def _send(self, notification: str) -> None:
         if not self._address:
             return
-        # a manager that is gone or too slow must not stop or block the process
+        # A manager that is gone or too slow must not stop or block the process.
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as datagrams:
             datagrams.setblocking(False)
-            datagrams.sendto(what.encode(), self._address)
+            datagrams.sendto(notification.encode(), self._address)
 
 
 def status_line(health: wire.Health) -> str:
-    """State, loop mode, rate and recording failure, in one line."""
+    """State of a process, its loop mode, rate of work and recording failure (those it has), in one line."""
     parts = [health.state]
     if health.mode:
         parts.append(LoopMode(health.mode).in_words)
