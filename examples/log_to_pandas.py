@@ -1,4 +1,4 @@
-"""Read a log into pandas: a row for each step, by time; needs `pip install pandas`.
+"""Read a log into pandas: a row for each step, indexed by its time; needs `pip install pandas`.
 
 Example: python examples/log_to_pandas.py logs/20270101T220000Z.mcap
 """
@@ -15,7 +15,7 @@ from lowfc import LogReader, read_history
 def table(path: Path) -> pd.DataFrame:
     """Modal error, pseudo-open-loop modes and command of every step, nm rms of wavefront, and the flux in DN.
 
-    All but the command are NaN if the frame was refused.
+    All values but the command are NaN if the frame was refused.
     """
     history = read_history(LogReader(path))
     steps, calibration = history.steps, history.calibration

@@ -6,7 +6,7 @@ from importlib import import_module
 
 
 def main(module: str = "lowfc.programs.cli.main") -> None:
-    """Entry point; while modules load, Ctrl-C ends the process without a traceback."""
+    """Entry point, which runs `main` of `module`; while modules load, Ctrl-C ends the process without a traceback."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     import_module(module).main()
 

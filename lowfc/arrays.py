@@ -22,9 +22,9 @@ def single(array: npt.ArrayLike) -> Single:
 
 
 def aligned(array: npt.ArrayLike) -> Single:
-    """Copy to single precision in C order, starting at a cache line.
+    """Copy to single precision in C order, with the first byte at the start of a cache line.
 
-    numpy aligns arrays to 16 bytes only, where every other vector load would cross the border of a cache line.
+    numpy aligns arrays to 16 bytes only: every other vector load may then cross the border of a cache line.
     """
     values = np.asarray(array, np.float32)
     memory = np.empty(values.nbytes + _CACHE_LINE, np.uint8)

@@ -1,19 +1,19 @@
-"""The rerun viewer as a child process: a window, headless, or a page for the browser.
+"""The rerun viewer as a child process: as a window, without a screen (headless), or as a page for the browser.
 
 It listens on loopback only, does not use the network, and ends with its parent. The binary is started directly: rerun's
-servers in a Python process cannot be bound to an address, and the script `rerun` leaves the binary behind when it is
-killed.
+servers in a Python process cannot be bound to an address, and the script `rerun` leaves the binary running when the
+script is killed.
 
 Measured with rerun 0.41:
 
-- `RecordingStream.log` to a hanging viewer continues until about 100 MB are unsent (this process grows by 150 MB), then
-  blocks. With a dead viewer the process does not grow and the call does not block; a new stream with the same ids to a
+- `RecordingStream.log` to a hanging viewer continues until about 100 MB are unsent (its process grows by 150 MB), then
+  blocks. With a dead viewer it neither blocks nor lets the process grow; a new stream with the same ids to a
   new viewer on the same port continues the recording.
 - `disconnect`, `del`, and the end of the process block while the viewer hangs: call stop() first.
 - A browser's page must be reloaded after its server has restarted.
-- The memory limit applies to the data as counted by rerun: the memory of a viewer levelled off at 184 MB for "100MB",
-  that of a headless viewer at 545 MB for "200MB".
-- ViewerClient has no timeout: all calls here run in a thread that may be abandoned.
+- The memory limit applies to the data as counted by rerun: the memory of a viewer levelled off at 184 MB for the limit
+  "100MB", that of a headless viewer at 545 MB for "200MB".
+- ViewerClient has no timeout: all its calls here run in a thread that may be abandoned.
 """
 
 import http.client
@@ -49,8 +49,8 @@ _START_S = 20.0
 _POLL_S = 0.05
 _CALL_S = 20.0
 _STOP_S = 1.0
-_REDRAW_S = 0.5  # longer than a pause in the animation of a notification
-_FAILURES = ("panicked at", "Error:", "ERROR")
+_REDRAW_S = 0.5  # between two images: longer than a pause in the animation of a notification
+_FAILURE_MARKS = ("panicked at", "Error:", "ERROR")  # in lines of the viewer's output
 _HTTP2_HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])  # with empty SETTINGS
 
 Answer = TypeVar("Answer")
@@ -71,7 +71,7 @@ class Show(StrEnum):
 class RerunViewer:
     """One viewer, running from construction until stop() or the end of its `with` block.
 
-    A RecordingStream connects to its `url`, a browser to its `web_address`, which is None unless `show` is WEB.
+    A RecordingStream connects to `url`, a browser to `web_address`, which is None unless `show` is WEB.
     """
 
     def __init__(
@@ -83,9 +83,9 @@ class RerunViewer:
         port: int | None = None,
         web_port: int | None = None,
     ) -> None:
-        """Start the viewer and wait until it answers; None selects a free port.
+        """Start the viewer and wait until it answers; a port of None is replaced by a free one.
 
-        `memory_limit` bounds the data kept of the stream; `size_px` (width, height) is for headless mode.
+        `memory_limit` bounds the data of the stream that the viewer keeps; `size_px` is (width, height) if headless.
 
         Raises:
             ViewerError: the binary, a screen or a driver is missing, or the viewer does not start.
@@ -130,7 +130,7 @@ class RerunViewer:
 
     @property
     def alive(self) -> bool:
-        """Whether its process exists, hanging or not."""
+        """Whether its process exists, even if it hangs."""
         return self._child.process is not None and self._child.status is None
 
     def answers(self, timeout_s: float = 1.0) -> bool:
@@ -165,10 +165,10 @@ class RerunViewer:
         self._stderr.close()
 
     def screenshot(self, path: Path | None = None, timeout_s: float = 20.0) -> bytes:
-        """PNG of the whole viewer once two consecutive images after loading are equal, or `timeout_s` after loading.
+        """PNG of the whole viewer: after loading, the first image equal to the one before, or the last in `timeout_s`.
 
         Raises:
-            ViewerError: the viewer does not answer, or has not loaded everything within the timeout.
+            ViewerError: the viewer does not answer, or has not loaded everything within `timeout_s`.
             DataFileError: the file cannot be written.
         """
         deadline_s = time.monotonic() + timeout_s
@@ -214,7 +214,7 @@ class RerunViewer:
             self._stderr.seek(0)
             self._output = self._stderr.read().decode(errors="replace")
         lines = [line.strip() for line in self._output.split("\n") if line.strip()]
-        failures = [line for line in lines if any(word in line for word in _FAILURES)]
+        failures = [line for line in lines if any(mark in line for mark in _FAILURE_MARKS)]
         return next(iter(failures or lines[-1:]), "it wrote nothing")
 
     def _page_is_served(self) -> bool:
@@ -228,7 +228,7 @@ class RerunViewer:
             page.close()
 
     def _draws(self) -> bool:
-        """Whether the viewer itself is up: without a graphics driver its server alone runs for a moment."""
+        """Whether the viewer draws: without a graphics driver, only its server runs for a moment."""
         try:
             if self.show is Show.HEADLESS:
                 return self.answers() and bool(self._ask(lambda client: client.take_screenshot(max_size=16)))
@@ -237,7 +237,7 @@ class RerunViewer:
             return False
 
     def _ask_again(self, question: "Callable[[ViewerClient], Answer]", deadline_s: float) -> Answer:
-        """Query the viewer, again after a failure until the deadline: on a loaded host it abandons queries."""
+        """Query the viewer, and repeat a failed query until the deadline: on a loaded host it abandons queries."""
         while True:
             try:
                 return self._ask(question)
@@ -292,7 +292,7 @@ def web_address(url: str, web_port: int) -> str:
 
 
 def has_screen() -> bool:
-    """Whether there is a screen for a window."""
+    """Whether the environment names a screen for a window."""
     return any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
 
 
@@ -326,7 +326,7 @@ def _arguments(show: Show, memory_limit: str, size_px: tuple[int, int], source_p
 
 
 def _environment(show: Show) -> dict[str, str]:
-    """Environment of the viewer: no usage statistics, no network access, warnings only."""
+    """Environment of the viewer: no usage statistics, no network access, no output below warnings."""
     environment = {name: value for name, value in os.environ.items() if name.lower() != "no_proxy"}
     require_screen(show)
     if show is Show.HEADLESS and not any(environment.get(name) for name in _DRIVER_VARIABLES):
