@@ -15,7 +15,7 @@ pytestmark = pytest.mark.exclusive
 
 COMPUTED = (
     "lowfc calibrate --method analytic --config lowfc.toml --out computed.fits",
-    "lowfc calibrate --method analytic --config lowfc.toml --at 4=15,7=-10 --out there.fits",
+    "lowfc calibrate --method analytic --config lowfc.toml --at 4=15,7=-10 --out zero_point.fits",
 )
 OPEN_LOOP = (
     "lowfc calibrate --method hadamard --out night.fits",
@@ -89,6 +89,6 @@ def test_every_command_of_the_calibration_and_acceptance_pages_runs(tmp_path: Pa
     with in_background(tmp_path, WITH_CALIBRATION):
         until(lambda: "bench" in running())
         until(lambda: subprocess.run(STATUS, capture_output=True, check=False).returncode == 0)
-    assert {"computed.fits", "there.fits", "night.fits", "aligned.fits", "lqg.fits", "rejection.png"} <= {
+    assert {"computed.fits", "zero_point.fits", "night.fits", "aligned.fits", "lqg.fits", "rejection.png"} <= {
         path.name for path in tmp_path.iterdir()
     }
