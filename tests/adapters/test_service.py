@@ -12,7 +12,7 @@ import pytest
 
 from lowfc import __version__
 from lowfc.adapters.process.realtime import Granted
-from lowfc.adapters.process.service import HEALTH_PERIOD_NS, PRINTED, PRINTED_NS, WAITING_NS
+from lowfc.adapters.process.service import HEALTH_PERIOD_NS, MAX_PRINTED, PRINTED_PERIOD_NS, WAITING_NS
 from lowfc.contract.envelope import count_of
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, HEALTH, from_timestamp, wire
 from lowfc.testing.clock import FakeClock
@@ -151,15 +151,19 @@ def test_a_flood_of_warnings_is_in_the_log_whole_and_on_the_terminal_in_part(
     listener: Listener, clock: FakeClock, capsys: pytest.CaptureFixture[str]
 ) -> None:
     controller = listener.service("controller")
-    for number in range(2 * PRINTED):
+    for number in range(2 * MAX_PRINTED):
         controller.event("FRAMES_MISSING", count=1, number=number)
     controller.event("CLOCK_OFF", ahead_ms=200)
-    clock.advance(PRINTED_NS)
+    clock.advance(PRINTED_PERIOD_NS)
     controller.event("FRAMES_MISSING", count=1, number=99)
-    assert len(listener.event_texts("FRAMES_MISSING")) == 2 * PRINTED + 1
+    assert len(listener.event_texts("FRAMES_MISSING")) == 2 * MAX_PRINTED + 1
     printed = capsys.readouterr().err.splitlines()
-    assert [line.split()[1] for line in printed] == [*["FRAMES_MISSING"] * (PRINTED + 1), "CLOCK_OFF", "FRAMES_MISSING"]
-    assert printed[PRINTED] == "controller: FRAMES_MISSING recurs: more within 10 s are in the log only"
+    assert [line.split()[1] for line in printed] == [
+        *["FRAMES_MISSING"] * (MAX_PRINTED + 1),
+        "CLOCK_OFF",
+        "FRAMES_MISSING",
+    ]
+    assert printed[MAX_PRINTED] == "controller: FRAMES_MISSING recurs: more within 10 s are in the log only"
     assert "before frame 99" in printed[-1]
 
 

@@ -214,11 +214,11 @@ def analytic_calibration(
 
     active = active_actuators(config)
     with raised_as(ConfigurationError, ValueError, "mirror"):
-        commands = modes_to_actuators(mirror(config), nolls, active)
+        shapes = modes_to_actuators(mirror(config), nolls, active)
     sensed = actuators_to_modes(R, light, good, optics, on_nodes, opd_nm)
     if active is not None:
         sensed[:, ~active.reshape(-1)] = 0
-    commands = commands @ np.linalg.inv(sensed @ commands)
+    shapes = shapes @ np.linalg.inv(sensed @ shapes)
 
     return with_identity(
         Calibration(
@@ -228,7 +228,7 @@ def analytic_calibration(
             reconstructor=single(R),
             good=single(good),
             dark=np.full(I0.size, _dark_dn(camera), np.float32),
-            modes_to_actuators=single(commands),
+            modes_to_actuators=single(shapes),
             shape=(shape[0], shape[1]),
             grid=(config.mirror.rows, config.mirror.columns),
             flux_dn=flux_e * camera.em_gain / camera.gain_e_per_dn,

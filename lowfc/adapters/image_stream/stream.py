@@ -212,12 +212,12 @@ class Stream:
 
     def _put_in_ring(self) -> None:
         """Copy the image to the next place of the circular buffer."""
-        after = int(self._header["ring_index"][0]) + 1
-        index = after if after < self.layout.ring else 0
+        following = int(self._header["ring_index"][0]) + 1
+        index = following if following < self.layout.ring else 0
         image = self.data.reshape(-1).view(np.uint8)
         start = self.layout.starts["ring"] + index * image.size
         np.ndarray(image.size, np.uint8, self._mapping, start)[:] = image
-        self._header["ring_cycle"] += np.uint64(index != after)
+        self._header["ring_cycle"] += np.uint64(index != following)
         self._header["ring_index"] = index
 
     def take_semaphore(self) -> int:

@@ -49,14 +49,14 @@ class LogCopy:
             include: decides whether to copy a message.
             include_record: decides whether to copy metadata or an attachment.
         """
-        done = 0
+        added = 0
         for message in reader:
-            self._add_records(reader.records[done:], include_record)
-            done = len(reader.records)
+            self._add_records(reader.records[added:], include_record)
+            added = len(reader.records)
             self.read += 1
             if include(message):
                 self._add_message(reader, message)
-        self._add_records(reader.records[done:], include_record)
+        self._add_records(reader.records[added:], include_record)
 
     def finish(self) -> None:
         """Write the index."""

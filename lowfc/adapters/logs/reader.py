@@ -18,7 +18,7 @@ from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import Topic
 
 _PREFIX_BYTES = 64  # identifies a chunk together with its 32-bit CRC, which two of a night's chunks may share
-_MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, count, log time, publish time
+_MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel id, count, log time, publish time
 
 
 class LogReader:
@@ -134,12 +134,12 @@ class LogReader:
 
     def _needs(self, end_ns: int, channels: Collection[int]) -> bool:
         """Whether to read a chunk with these channels that ends at `end_ns`; it may declare an unknown channel."""
-        if any(number not in self._delivered for number in channels):
+        if any(channel_id not in self._delivered for channel_id in channels):
             return True
         if end_ns < self._from_ns:
-            keys = [self._declared[number].topic.removeprefix("/") for number in channels]
+            keys = [self._declared[channel_id].topic.removeprefix("/") for channel_id in channels]
             return any(topic.matches(key) for topic in self._always for key in keys)
-        return not self._sparse or any(self._delivered[number] for number in channels)
+        return not self._sparse or any(self._delivered[channel_id] for channel_id in channels)
 
     def _chunk(self, chunk: Chunk) -> list[Sample]:
         """Messages of a chunk; none of a repeated or inconsistent chunk, which counts as damage."""
@@ -172,13 +172,13 @@ class LogReader:
                 opcode, length = read_head(content, at)
                 begin, at = at, at + head_bytes + length
                 if opcode == message_opcode:
-                    number, count, receive_time_ns, publish_time_ns = read_message(content, begin + head_bytes)
-                    channel = delivered.get(number)
+                    channel_id, count, receive_time_ns, publish_time_ns = read_message(content, begin + head_bytes)
+                    channel = delivered.get(channel_id)
                     if channel is not None:
                         key, start = channel
                         payload = content[begin + message_bytes : at]
                         samples.append(make_sample((key, payload, start | count, publish_time_ns, receive_time_ns)))
-                    elif number not in delivered:
+                    elif channel_id not in delivered:
                         self.unreadable += 1
                 elif opcode == Opcode.SCHEMA:
                     schema = parsed(Schema, content[begin + head_bytes : at])

@@ -34,7 +34,7 @@ from lowfc.control.loop.wording import counted
 HEALTH_PERIOD_NS = 500_000_000
 WAITING_NS = 2_000_000_000
 """A ready process that announces its state and waits longer than this for others prints their names."""
-PRINTED, PRINTED_NS = 10, 10_000_000_000
+MAX_PRINTED, PRINTED_PERIOD_NS = 10, 10_000_000_000
 """Largest number of warnings of one kind printed on standard error within this time, ns; all are in the log."""
 WORK: dict[str, str] = {Role.CAMERA: "frame", Role.CONTROLLER: "frame", Role.MIRROR: "command"}
 """What `Service.work` counts in the processes of the loop; other processes have their own summary."""
@@ -243,7 +243,8 @@ class Service:
     def event(self, event: str, **details: object) -> None:
         """Publish an event of the table; callable from any thread.
 
-        Errors and warnings are also printed on standard error; of one warning, at most `PRINTED` within `PRINTED_NS`.
+        Errors and warnings are also printed on standard error; warnings of one kind at most `MAX_PRINTED` times within
+        `PRINTED_PERIOD_NS`.
         """
         kind = EVENTS[event]
         log = kind.log(self.name, self.clock.now_ns(), **details)
@@ -252,13 +253,13 @@ class Service:
         if kind.level >= Level.WARNING:
             self._last_warning, now_ns = log, self.clock.host_ns()
             since_ns, count = self._warned.get(event, (now_ns, 0))
-            if now_ns - since_ns >= PRINTED_NS:
+            if now_ns - since_ns >= PRINTED_PERIOD_NS:
                 since_ns, count = now_ns, 0
             self._warned[event] = since_ns, count + 1
-            if count < PRINTED or kind.level > Level.WARNING:
+            if count < MAX_PRINTED or kind.level > Level.WARNING:
                 self._print(log.message)
-            elif count == PRINTED:
-                self._print(f"{event} recurs: more within {PRINTED_NS // 10**9} s are in the log only")
+            elif count == MAX_PRINTED:
+                self._print(f"{event} recurs: more within {PRINTED_PERIOD_NS // 10**9} s are in the log only")
 
     def _announce(self, what: str) -> None:
         if self.announces:
