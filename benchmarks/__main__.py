@@ -21,7 +21,7 @@ BENCHMARKS = {
 
 
 def main() -> int:
-    """The command line; returns its exit status."""
+    """Run the command line; return its exit status."""
     parser = argparse.ArgumentParser("python -m benchmarks", description=__doc__)
     parser.add_argument("name", choices=BENCHMARKS, help="NAME --help describes the measurement and its options")
     name = parser.parse_args(sys.argv[1:2]).name

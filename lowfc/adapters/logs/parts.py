@@ -221,16 +221,16 @@ def _newest(folder: Path) -> list[Path]:
         ) from None
     if not files:
         raise DataFileError(f"`{LAST}` is the newest log in {folder}, and there is none; {hint}")
-    order = {}
+    rank = {}
     for path, match in files.items():
         time, repeat, suffix, part = match.groups()
-        order[path] = time, int(repeat or 1), not (suffix or part), suffix == "-recovered", bool(part)
+        rank[path] = time, int(repeat or 1), not (suffix or part), suffix == "-recovered", bool(part)
     # Of several files with the same time and number, prefer a finished log, then a recovered one, then an unfinished.
-    best = {order[path][:2]: path for path in sorted(files, key=order.__getitem__)}
-    newest = best.pop(max(best))
+    preferred = {rank[path][:2]: path for path in sorted(files, key=rank.__getitem__)}
+    newest = preferred.pop(max(preferred))
     recording, number = _recording_and_number(newest)
     parts = {number: newest}
-    for path in best.values():
+    for path in preferred.values():
         if number > 1 and path.name >= recording[-1].partition("Z")[0]:  # not older than the recording
             key, other = _recording_and_number(path)
             if key == recording:
