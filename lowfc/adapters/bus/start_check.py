@@ -1,4 +1,4 @@
-"""Refusal of sequences whose start is too far in the future: after one of these, valid ones would seem out of order."""
+"""Refusal of sequences whose start is too far in the future: after such a one, valid ones would seem out of order."""
 
 from collections.abc import Callable
 from datetime import UTC, datetime
