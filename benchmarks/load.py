@@ -15,7 +15,7 @@ import psutil
 
 from benchmarks.runner import Result
 
-MODULES = {
+ROLES = {
     "sim_camera": "camera",
     "lowfc.programs.measure.frame_source": "camera",
     "lowfc controller": "controller",
@@ -99,9 +99,9 @@ def shares(samples: Sequence[Sample], seconds: float) -> dict[str, Result]:
 
 
 def role_of(arguments: Sequence[str]) -> str | None:
-    """Role of a process, from its command line; None if its module is not in `MODULES`."""
+    """Role of a process, from its command line; None if its module is not in `ROLES`."""
     module = arguments[arguments.index("-m") + 1 :] if "-m" in arguments else []
-    return MODULES.get(" ".join(module[:1])) or MODULES.get(" ".join(module[:2]))
+    return ROLES.get(" ".join(module[:1])) or ROLES.get(" ".join(module[:2]))
 
 
 def run_lowfc(arguments: Sequence[str], seconds: float) -> dict[str, Any]:
