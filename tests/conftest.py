@@ -1,4 +1,4 @@
-"""Fixtures of all tests: private runtime directories and caches; with LOWFC_NO_SKIPS=1 a skipped test fails."""
+"""Fixtures and start order of all tests; with LOWFC_NO_SKIPS=1 a skipped test fails."""
 
 import contextlib
 import gc
@@ -16,10 +16,10 @@ from lowfc.adapters.bus.run import Run, new_run_id, open_run
 
 NO_SKIPS = os.environ.get("LOWFC_NO_SKIPS") == "1"
 TESTS = Path(__file__).parent
-FIRST = frozenset(TESTS / name for name in ("optics", "control", "paper", "design", "contract", "sim"))
+EARLY_FOLDERS = frozenset(TESTS / name for name in ("optics", "control", "paper", "design", "contract", "sim"))
 """Folders whose tests hardly wait for other processes: they run beside the exclusive tests."""
-LONGEST = ("test_lockstep", "test_gain_watch", "test_calibrate", "test_tutorials", "test_commission", "test_what_if")
-"""Test files that are started next, so that no worker runs one of them alone at the end."""
+LONG_FILES = ("test_lockstep", "test_gain_watch", "test_calibrate", "test_tutorials", "test_commission", "test_what_if")
+"""Test files that are started after these folders, so that no worker runs one of them alone at the end."""
 gc.disable()  # nothing that the collection of tests imports is garbage
 
 
@@ -30,10 +30,10 @@ def pytest_collection_finish() -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     def start_order(item: pytest.Item) -> tuple[bool, bool, int]:
-        longest = LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST)
+        rank = LONG_FILES.index(item.path.stem) if item.path.stem in LONG_FILES else len(LONG_FILES)
         exclusive = _exclusive(item.path)
         assert exclusive or item.get_closest_marker("exclusive") is None, item.nodeid
-        return not exclusive, FIRST.isdisjoint(item.path.parents), longest
+        return not exclusive, EARLY_FOLDERS.isdisjoint(item.path.parents), rank
 
     items.sort(key=start_order)
 
@@ -58,7 +58,7 @@ class _Scheduling(LoadFileScheduling):
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Leave the processors to an exclusive test on another worker."""
+    """Run the other tests at idle priority, so that an exclusive test on another worker gets the processors."""
     if "PYTEST_XDIST_WORKER" in os.environ and not _exclusive(item.path):
         with contextlib.suppress(OSError):  # a container may forbid it
             os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
@@ -66,14 +66,14 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @cache
 def _exclusive(file: Path) -> bool:
-    """Whether a file has an exclusive test; xdist distributes names of tests, without their markers."""
+    """Whether a file has an exclusive test: read from its text, as xdist passes names of tests without markers."""
     text = file.read_text()
     return "pytest.mark.exclusive" in text or "@on_screen" in text
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _private_runtime(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Give all tests a private runtime directory, separate from the user's loops."""
+    """Give the tests of each worker a private runtime directory, separate from the user's loops."""
     path = tmp_path_factory.mktemp("runtime")
     path.chmod(0o700)
     os.environ["XDG_RUNTIME_DIR"] = str(path)
@@ -82,7 +82,7 @@ def _private_runtime(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def _private_cache(pytestconfig: pytest.Config) -> None:
-    """Cache optical models separately from the user's, in a folder shared by all workers and later sessions."""
+    """Cache optical models separately from the user's, in a folder that all workers and later sessions share."""
     os.environ["XDG_CACHE_HOME"] = str(pytestconfig.cache.mkdir("home"))
 
 
@@ -126,13 +126,13 @@ def restored_signals() -> Iterator[None]:
 
 @pytest.fixture
 def without_drawings(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Omit the drawings of reports, which take ten times as long as the rest."""
+    """Omit the drawings of reports, which take ten times as long as the rest of a report."""
     monkeypatch.setattr("lowfc.programs.logs.report.drawings._DRAWINGS", {})
 
 
 @pytest.fixture
 def without_layout(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Omit the layout of plots, which takes half of their time."""
+    """Omit the layout of plots, which takes half of the time of drawing them."""
     monkeypatch.setattr("lowfc.adapters.files.drawing.lay_out", lambda figure, *_: figure.set_layout_engine(None))
 
 

@@ -23,7 +23,7 @@ def sample(count: int, start_s: int = 100) -> Sample:
     return Sample("lowfc/camera/frame", b"", sequence_of(start_s, count), 0, 0)
 
 
-def test_a_gap_counts_as_missing_and_a_new_start_does_not() -> None:
+def test_a_gap_in_the_counts_is_missing_messages_and_a_restart_of_the_publisher_is_not() -> None:
     box = Mailbox()
     for count in (5, 6, 9):
         box.put(sample(count))
@@ -35,12 +35,12 @@ def test_a_gap_counts_as_missing_and_a_new_start_does_not() -> None:
     box.put(sample(41, start_s=101))  # a late message is delivered and closes its gap
     assert (box.missing, box.last_sequence) == (2, sequence_of(101, 42))
     assert box.take(0.0) == sample(41, start_s=101)
-    for count in (2**32 - 1, 2**32, 2**32 + 2):  # 50 days at 1 kHz: the count carries into the start
+    for count in (2**32 - 1, 2**32, 2**32 + 2):  # after 50 days at 1 kHz, the count carries into the start time
         box.put(sample(count, start_s=102))
     assert box.missing == 3
 
 
-def test_wake_ends_the_wait_at_once_and_only_once() -> None:
+def test_each_wake_ends_one_wait_at_once() -> None:
     box, begun_s = Mailbox(), time.monotonic()
     box.wake()
     assert box.take(PATIENCE_S) is None
@@ -77,7 +77,7 @@ def test_a_message_ends_the_wait_of_another_thread() -> None:
 
 @given(st.lists(st.sampled_from(["put", "take", "lose"]), max_size=40))
 def test_every_message_is_taken_skipped_missing_or_waiting(actions: list[str]) -> None:
-    box, taken, published = Mailbox(), 0, ""
+    box, taken, published = Mailbox(), 0, ""  # published: "x" for each message that was put, " " for each that was lost
     for action in actions:
         if action == "take":
             taken += box.take(0.0) is not None
@@ -94,7 +94,7 @@ PERIOD_NS = 1_000_000
 
 
 class TimedDispatch:
-    """A Dispatch whose handler takes a given time, and messages that arrive as soon as they are due."""
+    """A Dispatch whose handler takes `work_ns`; a message arrives when published, or 10 us after the last work."""
 
     def __init__(self, period_ns: int | None = PERIOD_NS, *, handle_superseded: bool = False) -> None:
         self.now_ns, self.work_ns = 10**9, 100_000
@@ -111,13 +111,13 @@ class TimedDispatch:
         return handle
 
     def arrive(self, count: int, put_ns: int) -> None:
-        self.now_ns = max(self.now_ns + 10_000, put_ns)  # time between two messages of the bus
+        self.now_ns = max(self.now_ns + 10_000, put_ns)  # 10 us: time between two queued messages of the bus
         self.dispatch.put(Sample(FRAME.key, b"", sequence_of(7, count), put_ns, self.now_ns))
 
 
 @pytest.mark.parametrize("handle_superseded", [True, False])
 def test_only_the_newest_of_the_queued_messages_is_handled(handle_superseded: bool) -> None:
-    """The process was stopped for ten periods, in which ten messages arrived."""
+    """The process stood still for ten periods, in which ten messages arrived."""
     timed = TimedDispatch(handle_superseded=handle_superseded)
     timed.work_ns = 20_000
     begun_ns = timed.now_ns + 10**8
@@ -136,7 +136,7 @@ def test_a_single_old_message_counts_as_superseded() -> None:
     timed.now_ns += 10**9
     timed.arrive(1, timed.now_ns - OLD_NS)
     timed.now_ns += 10**9
-    timed.arrive(2, timed.now_ns - PERIOD_NS)  # late by a period, but nothing shows that there is a newer one
+    timed.arrive(2, timed.now_ns - PERIOD_NS)  # late by a period, but not queued: nothing shows that a newer one exists
     assert timed.handled == [0, 2]
 
 
@@ -163,21 +163,21 @@ def test_a_slow_handler_never_falls_far_behind() -> None:
     assert len(timed.handled) + len(timed.superseded) + timed.dispatch.skipped == timed.dispatch.received == 500
 
 
-def test_two_receive_threads_take_turns() -> None:
+def test_the_handler_is_never_run_by_two_receive_threads_at_once() -> None:
     """Each link of the bus has its own thread, and so has the direct link."""
-    inside, most_inside, entered = 0, 0, threading.Barrier(2)
+    running, most_running, begin = 0, 0, threading.Barrier(2)  # numbers of handlers that run at once
 
     def handle(_: Sample) -> None:
-        nonlocal inside, most_inside
-        inside += 1
+        nonlocal running, most_running
+        running += 1
         time.sleep(0)  # lets the other thread run
-        most_inside = max(most_inside, inside)
-        inside -= 1
+        most_running = max(most_running, running)
+        running -= 1
 
     dispatch = Dispatch(FRAME.key, handle, time.monotonic_ns)
 
     def receive(start_s: int) -> None:
-        entered.wait(PATIENCE_S)
+        begin.wait(PATIENCE_S)
         for count in range(1000):
             dispatch.put(Sample(FRAME.key, b"", sequence_of(start_s, count), 0, 0))
 
@@ -186,7 +186,7 @@ def test_two_receive_threads_take_turns() -> None:
         thread.start()
     for thread in threads:
         thread.join(PATIENCE_S)
-    assert (dispatch.received, most_inside) == (2000, 1)
+    assert (dispatch.received, most_running) == (2000, 1)
 
 
 def test_only_messages_that_never_arrive_are_missing_whatever_the_order_of_the_others() -> None:

@@ -1,4 +1,4 @@
-"""Envelopes, sequences, names and starts: which ones a process accepts from the bus."""
+"""Which envelopes, sequences, names and start times a process accepts from the bus."""
 
 from collections.abc import Callable
 
@@ -55,7 +55,7 @@ NOW_S = SIMULATED_START_NS // 10**9
 DAY_S = 86_400
 
 
-def test_a_start_far_ahead_of_the_hosts_clock_is_refused_and_reported_with_both_times() -> None:
+def test_a_start_time_far_ahead_of_the_hosts_clock_is_refused_and_reported_with_both_times() -> None:
     reported: list[tuple[str, str]] = []
     clock = FakeClock()
     check = StartCheck(clock, 24.0, lambda start, here: reported.append((start, here)))
@@ -83,13 +83,13 @@ def test_a_start_far_ahead_of_the_hosts_clock_is_refused_and_reported_with_both_
         (FakeClock(4_102_444_800 * 10**9), 24.0, 4_102_444_800 + 2 * DAY_S, True),
     ],
 )
-def test_starts_are_compared_with_the_hosts_clock(
+def test_start_times_are_compared_with_the_hosts_clock(
     clock: FakeClock, max_ahead_h: float, start_s: int, ahead: bool
 ) -> None:
     assert StartCheck(clock, max_ahead_h, lambda start, here: None).ahead(sequence_of(start_s, 1 << 20)) is ahead
 
 
-FORGED = 1000
+FORGED_NAMES = 1000
 
 
 def health(number: int = 0) -> bytes:
@@ -110,7 +110,7 @@ def test_the_number_of_names_per_topic_is_limited_except_for_roles() -> None:
     assert names.admit(FRAME, FRAME.key) == ""
 
 
-def test_the_sizes_of_names_and_healths_are_limited() -> None:
+def test_the_sizes_of_names_and_of_health_messages_are_limited() -> None:
     names = Names()
     assert names.admit(HEALTH, HEALTH.at("n" * MAX_NAME_LENGTH))
     with pytest.raises(BadMessageError, match=f"up to {MAX_NAME_LENGTH} characters, got {MAX_NAME_LENGTH + 1}"):
@@ -134,19 +134,19 @@ def listener() -> Listener:
 
 def test_forged_names_do_not_fill_the_memory_of_a_process_and_give_one_event(listener: Listener) -> None:
     camera = listener.service("camera")
-    for number in range(FORGED):
+    for number in range(FORGED_NAMES):
         listener.bus.publisher(HEALTH, f"forged-{number}").put(health(number))
     listener.service("controller").beat()
     camera.beat()
     assert len(camera.last_health) == MAX_NAMES + 1
     assert "controller" in camera.last_health
     (event,) = listener.event_texts("BAD_MESSAGE")
-    assert event.startswith(f"BAD_MESSAGE {FORGED - MAX_NAMES} messages on lowfc/health/* could not be read")
+    assert event.startswith(f"BAD_MESSAGE {FORGED_NAMES - MAX_NAMES} messages on lowfc/health/* could not be read")
 
 
-def test_a_process_with_many_starts_is_stored_once(listener: Listener) -> None:
+def test_only_one_start_time_is_stored_of_a_process_that_restarts_often(listener: Listener) -> None:
     camera, stranger = listener.service("camera"), listener.bus.publisher(HEALTH, "stranger")
-    for number in range(FORGED):
+    for number in range(FORGED_NAMES):
         listener.bus.restart()
         stranger.put(health(number))
         assert camera.has_newcomers()
@@ -158,8 +158,8 @@ def test_forged_names_do_not_fill_the_memory_of_launcher_and_viewer() -> None:
     watch, view = Watch({}, []), Accumulator()
     launcher = MemoryBus(MemoryHub(), "launcher", FakeClock())
     launcher.subscribe(HEALTH, watch.add_health)
-    for number in range(FORGED):
+    for number in range(FORGED_NAMES):
         view.add(Sample(HEALTH.at(f"forged-{number}"), health(number), 1, 1, 1))
         launcher.publisher(HEALTH, f"forged-{number}").put(health(number))
     assert len(watch.health) == len(view.snapshot(1).health) == MAX_NAMES
-    assert view.unreadable == launcher.faults.unreadable[HEALTH.at("*")][0] == FORGED - MAX_NAMES
+    assert view.unreadable == launcher.faults.unreadable[HEALTH.at("*")][0] == FORGED_NAMES - MAX_NAMES

@@ -1,4 +1,4 @@
-"""Behaviour of every process: health, events, unreadable messages, and end by a signal."""
+"""Behaviour of every process: health, events, unreadable messages, and how a signal ends it."""
 
 import os
 import signal
@@ -66,7 +66,7 @@ def test_the_time_before_the_first_work_is_not_in_the_rate(
     camera = listener.service("camera")
     for number in range(40):
         clock.advance(HEALTH_PERIOD_NS if number else 10_250_000_000)  # a long start-up
-        camera.work = max(0, 1 + int((number - 8.25) * 0.5 * rate_hz)) if number > 8 else 0  # from 8.25 periods on
+        camera.work = max(0, 1 + int((number - 8.25) * 0.5 * rate_hz)) if number > 8 else 0  # after 8.25 periods
         camera.beat()
     rates = [health.rate_hz for health in listener.messages(HEALTH) if health.rate_hz]
     assert rates
@@ -77,7 +77,7 @@ def test_the_time_before_the_first_work_is_not_in_the_rate(
 def test_the_rate_of_slow_work_is_measured_over_several_units_of_work(
     listener: Listener, clock: FakeClock, rate_hz: float
 ) -> None:
-    """The rate also holds with an extra Health between two regular ones; when the work ends, it becomes 0."""
+    """The rate also holds when a change of state publishes the Health; it becomes 0 when the work has ended."""
     camera = listener.service("camera")
     for number in range(300):
         camera.work = int(number * 0.5 * rate_hz)
@@ -147,7 +147,7 @@ def test_events_are_published_and_warnings_printed(
     assert not capsys.readouterr().err, "a write would halt the process"
 
 
-def test_a_flood_of_warnings_is_in_the_log_whole_and_on_the_terminal_in_part(
+def test_all_warnings_of_a_flood_are_in_the_log_but_only_the_first_are_printed(
     listener: Listener, clock: FakeClock, capsys: pytest.CaptureFixture[str]
 ) -> None:
     controller = listener.service("controller")
@@ -191,7 +191,7 @@ def test_a_newcomer_gets_a_health_before_the_next_is_due(listener: Listener) -> 
     controller.beat()
     camera.beat()
     assert list(listener.messages(HEALTH)[-1].peers_alive) == ["controller"]
-    controller.state = "ready"  # its second Health: not a newcomer
+    controller.state = "ready"  # the controller's second Health, so that it is no newcomer
     camera.beat()
     assert [health.process for health in listener.messages(HEALTH)] == ["camera", "controller", "camera", "controller"]
     assert [camera.has_newcomers(), camera.has_newcomers()] == [True, False]

@@ -1,4 +1,4 @@
-"""`lowfc hosts` and `lowfc router --show` create no run; the numbers in docs/howto/hosts.md are those of the code."""
+"""When the commands for several hosts create a run, and that docs/howto/hosts.md has the numbers of the code."""
 
 import inspect
 import json
@@ -52,8 +52,8 @@ def test_a_missing_run_is_created_only_with_make() -> None:
 
 
 @pytest.mark.usefixtures("toml")
-def test_a_run_is_made_with_the_mirror_of_the_role() -> None:
-    for role in ("mirror-tt", "camera"):  # at the second role the run exists already
+def test_a_run_is_created_with_the_mirror_of_the_role() -> None:
+    for role in ("mirror-tt", "camera"):  # for the second role, the run exists already
         done = lowfc("config", "zenoh", "--role", role, "--make")
         assert done.exit_code == 0, done.exception
     assert set(open_run("default", ()).links.ports) == {"camera", "controller", "mirror-tt", "recorder"}
@@ -90,7 +90,7 @@ def test_lowfc_hosts_stores_its_connection_under_the_name_of_the_run_that_answer
 
 
 @pytest.mark.usefixtures("own_runtime")
-def test_a_run_that_cannot_be_joined_hides_no_other() -> None:
+def test_a_run_that_cannot_be_joined_is_listed_with_the_reason_and_hides_no_other_run() -> None:
     bench = ZenohBus(open_run("bench").links, Role.CAMERA, HostClock())
     with socket.create_server(("127.0.0.1", 0)) as router, closing(bench):
         address = f"tls/127.0.0.1:{router.getsockname()[1]}"
@@ -107,9 +107,9 @@ def test_a_run_that_cannot_be_joined_hides_no_other() -> None:
 def test_a_run_whose_router_does_not_answer_is_not_called_absent() -> None:
     open_run("stopped")
     open_run("across", network=NETWORK)
-    silent = f"the router of run 'across' at {NETWORK.router} does not answer"
-    assert refusal("ctl", "status", "--run", "across", kind=BusError).startswith(f"{silent}: is it running")
-    assert silent in refusal("ctl", "status", kind=BusError)
+    no_answer = f"the router of run 'across' at {NETWORK.router} does not answer"
+    assert refusal("ctl", "status", "--run", "across", kind=BusError).startswith(f"{no_answer}: is it running")
+    assert no_answer in refusal("ctl", "status", kind=BusError)
     assert "there is no run 'stopped'" in refusal("ctl", "status", "--run", "stopped", kind=BusError)
 
 
@@ -117,10 +117,10 @@ def test_a_run_whose_router_does_not_answer_is_not_called_absent() -> None:
 @pytest.mark.parametrize("command", ["record", "sim-loop", "config zenoh --role x", "config zenoh --role x --make"])
 def test_a_run_name_that_is_too_long_or_empty_is_refused(command: str) -> None:
     for name in ("x" * 300, ""):
-        fault = refusal(*command.split(), "--run", name, kind=BusError)
-        assert "--make" not in fault
-        assert len(fault) < 300
-        assert "a run's name is up to 48 of" in fault
+        error = refusal(*command.split(), "--run", name, kind=BusError)
+        assert "--make" not in error
+        assert len(error) < 300
+        assert "a run's name is up to 48 of" in error
 
 
 def test_the_configuration_of_the_router_is_shown_without_creating_its_run(toml: Path) -> None:

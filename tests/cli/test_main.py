@@ -17,7 +17,7 @@ from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.cli.runs import _lines
 
 
-def test_every_command_is_listed_under_its_heading_with_its_whole_description() -> None:
+def test_every_command_is_listed_under_its_heading_with_its_complete_description() -> None:
     lines = CliRunner().invoke(app, ["--help"], terminal_width=80).stdout.splitlines()
     assert max(map(len, lines)) <= 80
     for heading, rows in COMMANDS.items():
@@ -35,7 +35,7 @@ def contexts(context: click.Context) -> Iterator[click.Context]:
             yield from contexts(click.Context(command, parent=context, info_name=name))
 
 
-def test_every_help_page_has_an_example_whole_descriptions_and_no_colloquial_verbs() -> None:
+def test_every_help_page_has_an_example_no_shortened_descriptions_and_no_colloquial_verbs() -> None:
     pages = []
     for context in contexts(click.Context(typer.main.get_command(app), info_name="lowfc")):
         page = context.command.get_help(context)
@@ -48,8 +48,8 @@ def test_every_help_page_has_an_example_whole_descriptions_and_no_colloquial_ver
 
 
 def test_the_command_line_imports_no_large_package_before_a_command_is_used() -> None:
-    names = "('numpy', 'zenoh', 'rich')"
-    code = f"import sys, lowfc.programs.cli.main; print(*(name for name in {names} if name in sys.modules))"
+    packages = "('numpy', 'zenoh', 'rich')"
+    code = f"import sys, lowfc.programs.cli.main; print(*(name for name in {packages} if name in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "\n"
 
@@ -98,9 +98,9 @@ class LoopResult(Result):
     missing: float | None = result_field("missing", default=None)
 
 
-@pytest.mark.parametrize(("word", "value"), [("True", True), ("FALSE", False), ("2.5e1", 25.0), ("truer", "truer")])
-def test_a_bench_value_is_read_as_true_or_false_a_number_or_a_text(word: str, value: object) -> None:
-    assert (type(bench_value(word)), bench_value(word)) == (type(value), value)
+@pytest.mark.parametrize(("argument", "value"), [("True", True), ("FALSE", False), ("2.5e1", 25.0), ("truer", "truer")])
+def test_a_bench_value_on_the_command_line_is_a_boolean_a_number_or_a_text(argument: str, value: object) -> None:
+    assert (type(bench_value(argument)), bench_value(argument)) == (type(value), value)
 
 
 def test_text_and_json_of_a_result_have_the_same_fields() -> None:

@@ -67,7 +67,10 @@ SHAPE = np.arange(20.0).reshape(LOADED.grid)
 
 
 class FakeController:
-    """Decodes requests as the controller does, and answers with `reply`."""
+    """Decodes requests as the controller does; answers with `reply`, or not at all if `silent`.
+
+    The text of the answer to the request `configuration` is the attribute `configuration`.
+    """
 
     def __init__(self) -> None:
         self.hub = MemoryHub()
@@ -105,11 +108,11 @@ def short_patience(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(client, name, 0.05)
 
 
-WITHOUT_FIELDS = ("open", "close", "pause", "safe", "clear", "reset", "stop")
+REQUESTS_WITHOUT_FIELDS = ("open", "close", "pause", "safe", "clear", "reset", "stop")
 METHODS = {"open": Client.open_loop, "close": Client.close_loop}
 """Methods whose name differs from that of their request."""
 CALLS: tuple[tuple[Callable[[Client], object], Request], ...] = (
-    *((METHODS.get(name) or getattr(Client, name), Request(0, name)) for name in ("status", *WITHOUT_FIELDS)),
+    *((METHODS.get(name) or getattr(Client, name), Request(0, name)) for name in ("status", *REQUESTS_WITHOUT_FIELDS)),
     (lambda loop: loop.step(7), Request(0, "step", (), (7.0,))),
     (lambda loop: loop.gain(0.5, [2, 3]), Request(0, "gain", (2, 3), (0.5,))),
     (lambda loop: loop.gain(0.5, modes=2), Request(0, "gain", (2,), (0.5,))),
@@ -131,11 +134,11 @@ CALLS: tuple[tuple[Callable[[Client], object], Request], ...] = (
 )
 
 
-@pytest.mark.parametrize(("ask", "expected"), CALLS, ids=lambda value: getattr(value, "name", ""))
+@pytest.mark.parametrize(("call", "expected"), CALLS, ids=lambda value: getattr(value, "name", ""))
 def test_the_controller_decodes_each_request(
-    controller: FakeController, loop: Client, ask: Callable[[Client], object], expected: Request
+    controller: FakeController, loop: Client, call: Callable[[Client], object], expected: Request
 ) -> None:
-    answer = ask(loop)
+    answer = call(loop)
     assert controller.requests == [expected]
     expected_answer = (True, "done", 77, expected.text, None, "default")
     assert answer == ("" if expected.name == "configuration" else expected_answer)
@@ -226,7 +229,7 @@ def test_a_refused_request_raises_an_error_with_the_controllers_reply(controller
 
 
 @pytest.mark.parametrize(
-    ("ask", "why"),
+    ("call", "why"),
     [
         (lambda loop: loop.gain(0.1, [-2]), "gain refused: .*-2"),
         (lambda loop: loop.gain("much"), "gain refused: .*much"),
@@ -251,10 +254,10 @@ def test_a_refused_request_raises_an_error_with_the_controllers_reply(controller
     ],
 )
 def test_invalid_requests_are_refused_by_the_client(
-    controller: FakeController, loop: Client, ask: Callable[[Client], object], why: str
+    controller: FakeController, loop: Client, call: Callable[[Client], object], why: str
 ) -> None:
     with pytest.raises(RequestRefusedError, match=why):
-        ask(loop)
+        call(loop)
     assert controller.requests == []
 
 
@@ -265,9 +268,9 @@ def test_an_absent_and_a_silent_controller_give_different_errors(controller: Fak
     with pytest.raises(BusError, match="run 'default' has no recorder: start one, as with `lowfc record`"):
         loop.record(True)
     controller.bus.close()
-    for ask in (loop.open_loop, loop.calibration):
+    for call in (loop.open_loop, loop.calibration):
         with pytest.raises(BusError, match="run 'default' has no controller: start one, as with `lowfc controller`"):
-            ask()
+            call()
 
 
 def test_a_controller_without_a_calibration_accepts_a_channel_of_the_mirrors_grid(
@@ -315,21 +318,21 @@ def test_runs_are_found_by_their_listening_processes(own_runtime: Path, listen: 
     with pytest.raises(BusError, match=where):
         the_run(None)
     open_run("empty")
-    listen("left", "camera", "recorder")
-    assert the_run(None) == the_run("left") == "left"
-    with pytest.raises(BusError, match=r"there is no run 'empty': there is left \(no controller yet\)$"):
+    listen("partial", "camera", "recorder")
+    assert the_run(None) == the_run("partial") == "partial"
+    with pytest.raises(BusError, match=r"there is no run 'empty': there is partial \(no controller yet\)$"):
         the_run("empty")
     listen("whole", "camera", "controller")
     assert running() == ["whole"]
     (open_run("damaged").path / "links.json").write_text("")
-    assert (the_run("whole"), the_run("left")) == ("whole", "left"), "a damaged run does not affect others"
-    with pytest.raises(BusError, match=r"more than one run is live: left \(no controller yet\), whole; choose"):
-        the_run(None)  # `left` may be starting
+    assert (the_run("whole"), the_run("partial")) == ("whole", "partial"), "a damaged run does not affect others"
+    with pytest.raises(BusError, match=r"more than one run is live: partial \(no controller yet\), whole; choose"):
+        the_run(None)  # `partial` may be starting
     with pytest.raises(DataFileError, match=r"links\.json"):
         the_run("damaged")
 
 
-def test_a_wait_for_an_empty_run_reports_the_other_runs(listen: Callable[..., None]) -> None:
+def test_a_wait_for_a_run_without_processes_reports_the_other_runs(listen: Callable[..., None]) -> None:
     assert waiting_message("bnch").endswith("on this host yet; no other loop of yours is running")
     listen("bench", "camera", "controller")
     assert waiting_message("bench") == ""
@@ -350,7 +353,7 @@ def test_the_message_about_an_absent_process_says_whether_it_is_starting_stopped
     listen("dusk", "launcher", "controller")
     assert "was started with --no-record" in absence("dusk", Role.RECORDER)
     listen("bench", "camera")
-    for run in ("bench", "noon"):  # these were not started by sim-loop
+    for run in ("bench", "noon"):  # runs that `lowfc sim-loop` did not start
         assert absence(run, Role.CONTROLLER).startswith(f"run '{run}' has no controller: start one")
     with Client("bench") as loop:
         (open_run("bench").path / "links.json").touch()
@@ -449,7 +452,7 @@ def test_mirror_watch_reports_restarts_and_expired_commands_and_ignores_damaged_
 
 
 @pytest.mark.parametrize(("refused", "why"), [(Rejection.NO_MIRROR, "its driver failed"), (0, "the last one expired")])
-def test_mirror_watch_reports_a_mirror_that_stopped_following(refused: int, why: str) -> None:
+def test_mirror_watch_reports_a_mirror_that_did_not_follow_commands(refused: int, why: str) -> None:
     hub = MemoryHub()
     states = MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm")
 
@@ -459,7 +462,7 @@ def test_mirror_watch_reports_a_mirror_that_stopped_following(refused: int, why:
     watch = Client(bus=ReportingBus(hub, lambda: report(wire.MIRROR_STATUS_EXPIRED))).mirror_watch()
     report(wire.MIRROR_STATUS_FOLLOWING)
     watch.read()
-    assert watch.interruption == "", "an expired state before the first following one is no interruption"
+    assert watch.interruption == "", "the state EXPIRED before the first state FOLLOWING is no interruption"
     report(wire.MIRROR_STATUS_EXPIRED, refused)
     report(wire.MIRROR_STATUS_FOLLOWING)
     watch.read()
@@ -544,7 +547,7 @@ def test_a_slow_reader_loses_the_oldest_frames(controller: FakeController, loop:
 
 
 @pytest.mark.parametrize("payload", [b"\xff", b""])
-def test_an_invalid_answer_is_an_error_message(payload: bytes) -> None:
+def test_an_invalid_answer_gives_an_error_that_names_it(payload: bytes) -> None:
     hub = MemoryHub()
     controller = MemoryBus(hub, "controller", HostClock())
     controller.queryable(REQUEST_KEY.format(name="*"), lambda query: query.reply(b"\xff"))
@@ -558,8 +561,8 @@ def test_an_invalid_answer_is_an_error_message(payload: bytes) -> None:
 
 
 def test_a_step_is_decoded_unchanged() -> None:
-    three = np.array([1.5, -2.0, 0.25], np.float32)
-    sent = Step(9, 5_000, LoopMode.CLOSED, three, (Limit.SLEW,), three + 1, three + 2, 1234.5, 3)
+    command_nm = np.array([1.5, -2.0, 0.25], np.float32)
+    sent = Step(9, 5_000, LoopMode.CLOSED, command_nm, (Limit.SLEW,), command_nm + 1, command_nm + 2, 1234.5, 3)
     received = step_of(Sample(STEP.key, codec.encode_step(sent, 1), 0, 0, 0))
     for name in Step._fields:
         assert np.array_equal(getattr(received, name), getattr(sent, name)), name
@@ -568,7 +571,7 @@ def test_a_step_is_decoded_unchanged() -> None:
     assert step_of(Sample(STEP.key, b"\xff", 0, 0, 0)) is None
 
 
-def test_held_holds_the_loop_and_releases_it(controller: FakeController, loop: Client) -> None:
+def test_held_holds_the_loop_and_releases_it_after_an_error(controller: FakeController, loop: Client) -> None:
     assert loop.permit("moving the mask").accepted
     with pytest.raises(KeyError), loop.held("moving the mask", 5.0):
         raise KeyError
@@ -609,7 +612,7 @@ def test_the_declared_requests_match_the_implemented_ones() -> None:
     ]
     fields = set(wire.Request.DESCRIPTOR.fields_by_name)
     assert all({name for name, _ in declared.fields} <= fields for declared in DECLARED)
-    assert all(not by_key[REQUEST_KEY.format(name=name)].fields for name in WITHOUT_FIELDS)
+    assert all(not by_key[REQUEST_KEY.format(name=name)].fields for name in REQUESTS_WITHOUT_FIELDS)
 
 
 def test_mode_lists_are_parsed() -> None:
@@ -617,9 +620,9 @@ def test_mode_lists_are_parsed() -> None:
     assert noll_of(["2", "3"]) == noll_of(["2,3"]) == (2, 3)
     assert noll_of(["4-7, 11"]) == (4, 5, 6, 7, 11)
     assert noll_of(["3,2-4"]) == (3, 2, 4)
-    for word in ("0", "x", "2-", "-2", "2.5", "11-4", "2,11-4", "", ",", "2-9999999999"):
+    for invalid in ("0", "x", "2-", "-2", "2.5", "11-4", "2,11-4", "", ",", "2-9999999999"):
         with pytest.raises(ConfigurationError, match="as in 2,3 or 4-11"):
-            noll_of([word])
+            noll_of([invalid])
 
 
 def test_an_invalid_number_is_quoted_in_the_error() -> None:
@@ -722,17 +725,17 @@ def test_a_recording_is_stopped_and_restarted(bench: Bench) -> None:
     summary = bench.stop()
     assert [path.absolute() for path in summary.files] == [stopped, Path(started.text)]
     read = list(LogReader(summary.files[1]))
-    # A log begins with the last message of each of these topics.
+    # A log begins with the last calibration and the last state of the camera, published before it.
     assert [message.key for message in read[:2]] == [CALIBRATION.key, CAMERA_STATE.key]
     assert bodies_of(read, FRAME) == second[:5] + second[6:]
     assert "RECORDING recording" in [Log.FromString(body).message for body in bodies_of(read, EVENT)]
-    assert (summary.lost, summary.failure) == ({FRAME.key: 2}, ""), "messages while stopped do not count as lost"
+    assert (summary.lost, summary.failure) == ({FRAME.key: 2}, ""), "frames between the recordings do not count as lost"
     logs = [LogReader(path) for path in summary.files]
     counts = [len(list(log)) for log in logs]
     assert summary.messages == sum(counts)
     for log, count in zip(logs, counts, strict=True):
         account = {"messages": str(count), "messages_lost": "1", f"lost {FRAME.key}": "1"}
-        assert log.metadata["recording"] == account, "the account is of this recording, not of all recordings"
+        assert log.metadata["recording"] == account, "the counts are those of this recording, not of all recordings"
 
 
 def test_a_log_that_cannot_be_created_is_refused_and_the_answer_to_the_next_start_estimates_the_growth(
