@@ -34,7 +34,7 @@ from tests.support.report_log import TOY_CALIBRATION, SyntheticLog
 MULTISINE = {"duration_s": 3.0, "rms_nm": 3.0, "lines_per_mode": 8, "modes": (), "seed": 1}
 THREE_MODES = {
     "disturbance.preset": "quiet",
-    "camera.instants": 1,  # one suffices without a disturbance
+    "camera.instants": 1,  # per exposure; one suffices, as the wavefront changes only with the mirror
     "sensor.modes": 3,
     "star.magnitude": -1.0,
     "control.gain": 0.3,
@@ -56,6 +56,7 @@ def responses_of(loop: InProcessLoop, test: Any, **options: Any) -> list[ProbeRe
 
 
 def drawn(module: Any, result: AcceptanceResult) -> bytes:
+    """The plot of a test's result, as a PNG file."""
     figure = figure_class()(figsize=(4, 3))
     module.draw(result.json_object(), figure)
     return png(figure)
@@ -97,7 +98,7 @@ def test_with_a_pseudo_open_loop_law_the_multisine_is_added_to_the_mirror() -> N
 
 
 @pytest.mark.parametrize("multisine", [1.0], indirect=True)
-def test_a_disturbed_measurement_is_refused(multisine: tuple[InProcessLoop, ProbeResponse]) -> None:
+def test_an_unsuitable_or_disturbed_measurement_is_refused(multisine: tuple[InProcessLoop, ProbeResponse]) -> None:
     loop, response = multisine
     with pytest.raises(AcceptanceError, match="3 modes, from 2 Hz up"):
         responses_of(loop, rejection, **MULTISINE | {"duration_s": 0.1})
@@ -151,7 +152,7 @@ def test_a_probe_sequence_waits_for_a_mirror_that_has_just_restarted(monkeypatch
     assert linearity.judge([response], loop.config).passed
 
 
-def test_linearity_passes_the_simulated_sensor_and_fails_noise_or_a_halved_gain() -> None:
+def test_the_linearity_test_passes_the_simulated_sensor_and_fails_noise_or_a_halved_gain() -> None:
     loop = InProcessLoop(configured())
     with pytest.raises(AcceptanceError, match="2 frames at each level are too few: the first 3"):
         responses_of(loop, linearity, hold_frames=2, cycles=3, modes=(2,))
@@ -164,7 +165,7 @@ def test_linearity_passes_the_simulated_sensor_and_fails_noise_or_a_halved_gain(
     assert [row.amplitude_nm for row in mode.levels] == pytest.approx([6, 12, 24])
     noise_nm = np.random.default_rng(8).normal(0.0, 50.0, response.error_nm.shape)
     assert linearity.judge([replace(response, error_nm=response.error_nm + noise_nm)], loop.config).modes[0].too_noisy
-    # The last of repeated tests counts.
+    # Of repeated tests, the last one counts.
     halved = linearity.judge([response, replace(response, error_nm=0.5 * response.error_nm)], loop.config)
     assert [mode.passed for mode in halved.modes] == [False]
     assert "FAILED" in halved.text()
@@ -195,7 +196,7 @@ def test_the_capture_range_ends_at_the_modal_limit_or_the_sensor_range(
     assert not capture.judge(trials[:1], config).passed
 
 
-def test_a_capture_range_needs_a_gain() -> None:
+def test_a_capture_range_test_with_gains_of_zero_is_refused() -> None:
     loop = InProcessLoop(configured(control__gain=0.0))
     with pytest.raises(AcceptanceError, match="the gains of the tested modes are zero"):
         capture.judge(responses_of(loop, capture, modes=(4,)), loop.config)
@@ -260,7 +261,9 @@ def test_a_note_announces_the_probe_sequences_of_a_test_in_a_log() -> None:
     assert _announced(requests, "linearity") == _announced(requests, "capture-range") == []
 
 
-OPEN, CLOSED = (f'acceptance {{"test": "noise-floor", "loop": "{loop}", "frames": 50}}' for loop in ("open", "closed"))
+OPEN_NOTE, CLOSED_NOTE = (
+    f'acceptance {{"test": "noise-floor", "loop": "{loop}", "frames": 50}}' for loop in ("open", "closed")
+)
 """Notes that announce a noise-floor test in a log."""
 
 
@@ -273,7 +276,7 @@ def responses_in(log: Path) -> list[ProbeResponse]:
 def test_a_request_disturbs_a_measurement_unless_a_limit_ended_it_before(name: str, tmp_path: Path) -> None:
     def logged(limit_nm: float) -> list[ProbeResponse]:
         night = SyntheticLog(limit_nm=(limit_nm, limit_nm)).request("close").frames(20)
-        night.request("note", text=CLOSED).frames(20).request(name).frames(50)
+        night.request("note", text=CLOSED_NOTE).frames(20).request(name).frames(50)
         return responses_in(night.write(tmp_path / f"{limit_nm:g}.mcap"))
 
     with pytest.raises(DataFileError, match=f"request '{name}' disturbed the measurement"):
@@ -283,13 +286,13 @@ def test_a_request_disturbs_a_measurement_unless_a_limit_ended_it_before(name: s
 
 
 def test_a_disturbed_test_that_was_repeated_does_not_count(tmp_path: Path) -> None:
-    night = SyntheticLog().frames(20).request("note", text=OPEN).frames(20).request("reset")
-    log = night.request("note", text=OPEN).frames(60).write(tmp_path / "night.mcap")
+    night = SyntheticLog().frames(20).request("note", text=OPEN_NOTE).frames(20).request("reset")
+    log = night.request("note", text=OPEN_NOTE).frames(60).write(tmp_path / "night.mcap")
     assert len(responses_in(log)) == 1
 
 
 def test_a_log_that_ends_within_a_test_is_refused_with_what_is_missing(tmp_path: Path) -> None:
-    log = SyntheticLog().frames(20).request("note", text=CLOSED).frames(40).write(tmp_path / "night.mcap")
+    log = SyntheticLog().frames(20).request("note", text=CLOSED_NOTE).frames(40).write(tmp_path / "night.mcap")
     error = r"ends 10 of 50 frames before the end of a measurement \(noise-floor, loop closed\): give all files"
     with pytest.raises(DataFileError, match=error):
         responses_in(log)
@@ -299,7 +302,7 @@ def test_a_log_without_the_law_or_the_table_of_a_probe_sequence_is_refused(tmp_p
     night = SyntheticLog()
     night.law(0.3, logged=False)
     with pytest.raises(DataFileError, match=r"lawless\.mcap: the law \w+ is missing"):
-        responses_in(night.frames(20).request("note", text=OPEN).frames(60).write(tmp_path / "lawless.mcap"))
+        responses_in(night.frames(20).request("note", text=OPEN_NOTE).frames(60).write(tmp_path / "lawless.mcap"))
     note = 'acceptance {"test": "rejection", "period_frames": 10, "frames": 50}'
     night = SyntheticLog().request("close").frames(20).request("note", text=note)
     night.request("play", text="offset", table=np.zeros((50, 3), np.float32)).frames(60)
@@ -308,8 +311,8 @@ def test_a_log_without_the_law_or_the_table_of_a_probe_sequence_is_refused(tmp_p
         logged_responses(read_history(LogReader(night.write(tmp_path / "night.mcap"))), rejection.KIND)
 
 
-def test_a_test_in_a_log_is_evaluated_with_the_gains_and_the_calibration_of_its_time(tmp_path: Path) -> None:
-    night = SyntheticLog().frames(20).request("note", text=OPEN).frames(60)
+def test_a_test_in_a_log_is_evaluated_with_the_gains_and_the_calibration_in_use_during_it(tmp_path: Path) -> None:
+    night = SyntheticLog().frames(20).request("note", text=OPEN_NOTE).frames(60)
     night.request("gain", (0.1,)).request("safe").request("clear")
     night.load(with_identity(replace(TOY_CALIBRATION, flux_dn=1.0)))
     (response,) = responses_in(night.frames(5).write(tmp_path / "night.mcap"))

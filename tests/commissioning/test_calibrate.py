@@ -31,7 +31,7 @@ configured = partial(configuration, BRIGHT)
 FEW = {"sensor.modes": 3}
 """Few modes give short cycles, for tests that do not depend on the number of modes."""
 NOISELESS = FEW | {"camera.noise": False}
-"""For tests that do not depend on noise: without it, computing a frame takes half the time."""
+"""For tests that do not depend on noise: without noise, computing a frame takes half the time."""
 
 
 @pytest.fixture(autouse=True)
@@ -82,7 +82,7 @@ def calibrated(loop: InProcessLoop, method: str) -> tuple[Calibration, Calibrati
 def test_a_measured_calibration_reads_the_true_modes(
     monkeypatch: pytest.MonkeyPatch, method: str, delay_frames: float, modes: int, frames_lost: bool
 ) -> None:
-    """Lost frames do not bias the calibration."""
+    """The calibration is right for each method and delay; lost frames do not bias it."""
     monkeypatch.setattr(pokes, "HOLD", 4)
     config = configured(camera__delay_frames=delay_frames, sensor__modes=modes)
     loop = InProcessLoop(config, lose=lambda index: frames_lost and index > 300 and index % 41 == 0)
@@ -107,19 +107,21 @@ def test_a_measured_calibration_reads_the_true_modes(
     assert calibration.id != before.id
     assert calibration.estimator == f"weighted+{method}"
     # The fit may start from the provisional R of a commissioning; its result is not provisional.
-    from_first = data.measured._replace(initial=data.measured.initial._replace(estimator=f"weighted+{method}+first"))
-    assert not measured_calibration(config, before, from_first, CalibrationRequest(method, OUT, 50.0))[0].provisional
+    initial = data.measured.initial._replace(estimator=f"weighted+{method}+first")
+    from_provisional = data.measured._replace(initial=initial)
+    result, _ = measured_calibration(config, before, from_provisional, CalibrationRequest(method, OUT, 50.0))
+    assert not result.provisional
 
 
 def closed_residual_nm(config: Configuration, calibration: Calibration, world: Configuration) -> np.ndarray:
-    """Mean true residual (modes,), nm, in the second half of 200 frames of a closed loop in a simulated `world`."""
+    """Mean true residual (modes,), nm, in the last 100 of 200 frames of a closed loop in the simulated `world`."""
     loop = InProcessLoop(config, calibration, world)
     loop.close_loop()
     loop.run(200)
     return loop.residual_nm(100).mean(axis=0)
 
 
-def test_a_mirror_with_dead_actuators_and_misregistration_is_calibrated_and_closed() -> None:
+def test_a_loop_whose_mirror_has_dead_actuators_and_misregistration_is_calibrated_and_closed() -> None:
     dead = [40, 53, 66, 91, 104]
     active = np.ones(12 * 12)
     active[dead] = 0
@@ -142,10 +144,10 @@ def test_the_loop_holds_a_zero_point_that_is_not_flat() -> None:
     config = configured(**NOISELESS)
     loop = InProcessLoop(config, world=configured(**NOISELESS, disturbance__static_nm=zero_point_nm))
     calibration, _ = calibrated(loop, "hadamard")
-    zero = loop.residual_nm(0, 1)[0]
+    zero_nm = loop.residual_nm(0, 1)[0]
     moved = configured(**NOISELESS, disturbance__static_nm={"2": 20.0, "3": -10.0, "4": 35.0})  # Z2, Z4: +20 nm
-    difference = closed_residual_nm(config, calibration, moved) - zero
-    assert np.abs(difference).max() < 0.02 * 20.0
+    difference_nm = closed_residual_nm(config, calibration, moved) - zero_nm
+    assert np.abs(difference_nm).max() < 0.02 * 20.0
 
 
 def test_a_closed_loop_is_opened_for_pokes_and_closed_afterwards() -> None:
@@ -168,7 +170,7 @@ def test_a_closed_loop_is_opened_for_pokes_and_closed_afterwards() -> None:
         pass
 
 
-def test_unreadable_cycles_give_an_error_of_one_line() -> None:
+def test_an_unreadable_file_of_cycles_gives_an_error_of_one_line() -> None:
     path = partial_path(OUT)
     store(path, Sums.none(Initial(np.zeros((2, 4)), "weighted")), {"method": "poke"})
     intact = path.read_bytes()
@@ -233,7 +235,7 @@ def kill_mirror(loop: InProcessLoop) -> None:
     loop.mirror_bus.close()
 
 
-def expire(loop: InProcessLoop) -> None:
+def expire_command(loop: InProcessLoop) -> None:
     event = EVENTS["COMMAND_EXPIRED"].log("mirror-dm", 0, command_timeout_ms=200.0, action="relaxing to flat")
     loop.mirror_bus.publisher(EVENT).put(event.SerializeToString())
 
@@ -245,7 +247,7 @@ def restart_camera(loop: InProcessLoop) -> None:
 def test_a_probe_sequence_during_a_device_restart_is_stopped_at_once_and_repeated() -> None:
     faults = {
         1: (kill_mirror, InProcessLoop.start_mirror),
-        3: (expire, ignore),
+        3: (expire_command, ignore),
         5: (restart_camera, ignore),
         7: (InProcessLoop.silence_camera, ignore),
     }
@@ -265,9 +267,9 @@ def test_a_probe_sequence_during_a_device_restart_is_stopped_at_once_and_repeate
         strict=True,
     ):
         assert re.search(why, report)
-    assert (len(loop.begun), loop.stops) == (1 + 4 + 4, 4)
-    for play in faults:
-        assert loop.begun[play] < loop.begun[play - 1] + 80, "a sequence ends soon after the fault in its frame 50"
+    assert (len(loop.begun), loop.stops) == (1 + 4 + 4, 4)  # 1 delay measurement, 4 cycles, 4 repetitions
+    for number in faults:
+        assert loop.begun[number] < loop.begun[number - 1] + 80, "a sequence ends soon after the fault in its frame 50"
     assert np.abs(cross_talk(loop.calibration().reconstructor, data.measured.response)).max() < 0.05
 
 
@@ -279,15 +281,15 @@ def lose_mirror(loop: InProcessLoop) -> None:
 def test_a_probe_sequence_waits_until_the_controller_notices_that_a_restarted_mirror_follows(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The mirror's first state arrives before the controller reads its first Health; until then `play` is refused."""
+    """The mirror's state arrives before the controller reads the mirror's Health; until then `play` is refused."""
     loop, waited_s = FaultyLoop({1: (lose_mirror, InProcessLoop.start_mirror)}), list[float]()
 
-    def follow(seconds: float) -> None:
+    def wait(seconds: float) -> None:
         waited_s.append(seconds)
         if len(waited_s) == 2:
             loop.report_mirror("")
 
-    monkeypatch.setattr(recording, "sleep", follow)
+    monkeypatch.setattr(recording, "sleep", wait)
     _, data = measure(loop, "hadamard")
     assert len(waited_s) == 2
     assert data.measured.cycles == 4

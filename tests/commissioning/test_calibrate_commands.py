@@ -1,4 +1,4 @@
-"""`lowfc calibrate` and its subcommands on a loop in one process: files, results, errors, other wavefronts."""
+"""`lowfc calibrate` on a loop in one process: files, results, errors, calibrations at wavefronts other than flat."""
 
 import json
 import re
@@ -90,7 +90,8 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
 ) -> None:
     loop = noiseless_loop
     check = Calibrator.check
-    delay_measurement_frames = DELAY_FRAMES + 16  # before the time to go is reported; 16 at the ends of the sequence
+    # The delay is measured before the time to go is reported; its sequence has 16 more frames at its ends.
+    delay_measurement_frames = DELAY_FRAMES + 16
     monkeypatch.setattr(Calibrator, "check", Mock(side_effect=KeyboardInterrupt))
     before = loop.calibration()
     arguments = ["--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load"]
@@ -115,7 +116,7 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
     assert abs(result["delay_frames"] - 1) < 0.05
     assert result["frame_to_effect_ms"] == pytest.approx(4.0, rel=0.05)
     assert len(result["noise_gain_nm"]) == len(result["singular_values"]) == 3
-    # H was measured 6 nm from flat, where it differs a little from the computed H
+    # H was measured at 6 nm of Z4, where it differs a little from the computed H, which is for flat.
     assert result["cross_talk"] < 0.1 + 4 * result["cross_talk_error"]
     assert (result["recommended"], result["snr"]) == (True, 20)
     assert loop.calibration().id == calibration.id != before.id
@@ -191,7 +192,7 @@ def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(monkeyp
     assert "--resume --snr 200 --cycles " in result["faults"][0]  # --cycles alone would require an SNR of 20
     assert result["file"] == "night.rejected.fits"
     assert calibration_file.load(Path("night.rejected.fits")).id != before.id
-    assert not Path("night.fits").exists(), "an existing calibration would be overwritten"
+    assert not Path("night.fits").exists(), "a rejected calibration would replace an earlier one in this file"
     assert loop.calibration().id == before.id
     check, expose = Calibrator.check, loop.scene.expose
 
@@ -323,14 +324,16 @@ def test_a_poke_resolves_the_rotation_by_180_degrees(noiseless_loop: InProcessLo
     assert np.abs(cross_talk(calibration.reconstructor, noiseless_loop.calibration().response)).max() < 0.05
 
 
-def test_no_calibration_is_aligned_to_a_turned_mirror(loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A poke of tip makes tilt, so its image does not correlate with the computed one and cannot show the sign."""
+def test_the_alignment_with_a_mirror_turned_by_90_degrees_is_refused(
+    loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A poke of Z2 makes Z3, so its image does not correlate with the computed one and cannot show the sign."""
     play = loop.play
 
-    def turned(basis_nm: Any, table: Any) -> Any:
+    def play_turned(basis_nm: Any, table: Any) -> Any:
         return play(np.rot90(basis_nm.reshape(-1, 12, 12), axes=(1, 2)).reshape(basis_nm.shape), table)
 
-    monkeypatch.setattr(loop, "play", turned)
+    monkeypatch.setattr(loop, "play", play_turned)
     error = refusal("calibrate", "align", "--out", "aligned.fits", "--frames", "16", kind=CalibrationError)
     assert "the correlation is 0.0" in error
     assert not Path("aligned.fits").exists()
@@ -341,7 +344,7 @@ def test_no_calibration_is_aligned_to_a_turned_mirror(loop: InProcessLoop, monke
 def test_pokes_resolve_a_reflection_or_rotation_that_does_not_change_the_image(
     geometry: Geometry, pupil: dict[str, Any]
 ) -> None:
-    """Without a mask, the image of a circular pupil is circular; that of the prolate pupil has two axes of symmetry."""
+    """Without a mask, the image of a circular pupil is circular. That of the prolate pupil has two symmetry axes."""
     config = load(None, SMALL_MIRROR | {"sensor.kind": "clowfs", "sensor.modes": 3} | pupil)
     first = calibration_of(config.to_toml())
     image = first.reference.astype(float).reshape(80, 80)
@@ -355,7 +358,7 @@ def test_pokes_resolve_a_reflection_or_rotation_that_does_not_change_the_image(
     assert np.abs(cross_talk(calibration.reconstructor, H)).max() < 0.01
 
 
-def test_an_aligned_calibration_expects_the_light_of_the_good_pixels(
+def test_an_aligned_calibration_expects_the_light_of_the_good_pixels_only(
     noiseless_loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loop, before = noiseless_loop, noiseless_loop.calibration()
@@ -439,7 +442,7 @@ def test_a_comparison_of_different_sensors_and_a_missing_directory_are_refused(l
 
 
 def test_two_calibrations_are_compared_on_the_pixels_that_are_good_in_both() -> None:
-    """Both calibrations are for the same star and sensor; in one of them some pixels are dead."""
+    """Both calibrations are for the same star and sensor; in one of them five pixels are bad."""
     first = toy.calibration()
     good = np.ones(first.good.size)
     good[np.argsort(-first.reference)[[2, 7, 11, 20, 33]]] = 0
@@ -475,15 +478,15 @@ def test_the_option_at_accepts_a_mirror_shape_in_place_of_a_wavefront(config: Co
     command_nm = np.zeros(len(flat.noll))
     command_nm[[flat.noll.index(4), flat.noll.index(7)]] = 20.0, -20.0
     np.save("shape.npy", (flat.modes_to_actuators @ command_nm).reshape(flat.grid))
-    shaped = analytic(config, SILENT, zero_point(config, "shape.npy")[1])
+    at_shape = analytic(config, SILENT, zero_point(config, "shape.npy")[1])
     change = at_zero_point.reference - flat.reference
-    assert np.linalg.norm(shaped.reference - at_zero_point.reference) < 0.1 * np.linalg.norm(change)
+    assert np.linalg.norm(at_shape.reference - at_zero_point.reference) < 0.1 * np.linalg.norm(change)
     assert at_zero_point.id != flat.id
     assert at_zero_point.operator_hash == flat.operator_hash
     identity = np.eye(len(flat.noll))
     assert np.abs(at_zero_point.actuators_to_modes @ at_zero_point.modes_to_actuators - identity).max() < 1e-4
     change = at_zero_point.response - flat.response
-    assert np.linalg.norm(shaped.response - at_zero_point.response) < 0.1 * np.linalg.norm(change)
+    assert np.linalg.norm(at_shape.response - at_zero_point.response) < 0.1 * np.linalg.norm(change)
 
 
 @pytest.mark.parametrize(
@@ -498,22 +501,24 @@ def test_the_option_at_accepts_a_mirror_shape_in_place_of_a_wavefront(config: Co
         ({"star.magnitude": 6.0, "control.limit_nm": 1e5}, ""),  # the default limit would give a warning of noise
     ],
 )
-def test_a_computed_calibration_warns_of_its_configuration(keys: dict[str, Any], warned: str) -> None:
-    """It warns of noise above a modal limit, a mirror that does not span the pupil, and flux changed by rounding."""
+def test_the_computation_of_a_calibration_warns_of_an_unsuitable_configuration(
+    keys: dict[str, Any], warned: str
+) -> None:
+    """Warnings: noise above a modal limit, a mirror smaller than the pupil, flux changed by rounding or clipping."""
     analytic(load(None, keys), Console(file=(printed := StringIO())))
     assert warned in printed.getvalue()
     assert ("warning" in printed.getvalue()) is bool(warned)
 
 
 def test_a_loop_with_a_calibration_at_a_wavefront_converges_to_it() -> None:
-    few = load(None, BRIGHT | {"sensor.modes": 6})
+    config = load(None, BRIGHT | {"sensor.modes": 6})
     world = load(None, BRIGHT | {"sensor.modes": 6, "disturbance.static_nm": {"4": 35.0, "6": 20.0}})
-    calibration = analytic(few, SILENT, zero_point(few, "4=15,7=-10")[1])
-    loop = InProcessLoop(few, calibration, world)
+    calibration = analytic(config, SILENT, zero_point(config, "4=15,7=-10")[1])
+    loop = InProcessLoop(config, calibration, world)
     loop.close_loop()
     loop.run(200)
-    held = np.mean(loop.residual_nm(100), axis=0)[:6]
-    assert held == pytest.approx([0, 0, 15, 0, 0, -10], abs=0.02 * 20)
+    held_nm = np.mean(loop.residual_nm(100), axis=0)[:6]
+    assert held_nm == pytest.approx([0, 0, 15, 0, 0, -10], abs=0.02 * 20)
 
 
 def test_an_invalid_wavefront_for_the_option_at_is_an_error(config: Configuration, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Accuracy of calibrations compared with the requested signal-to-noise ratio, in one process and over the bus."""
+"""Whether calibrations are as accurate as the requested signal-to-noise ratio, in one process and over the bus."""
 
 import re
 from pathlib import Path
@@ -29,29 +29,28 @@ from tests.support.loops import interrupt, run, start, until
 REACHABLE = ("quiet", "thermal", "bench", "step", "kolmogorov")
 """Disturbance presets at which a signal-to-noise ratio of 30 is reached."""
 WHEEL = "reaction-wheel"
-"""Preset with 34 nm of tilt, at which pokes of some nm cannot reach a signal-to-noise ratio of 30."""
+"""Preset with 34 nm rms of each tilt, at which pokes of a few nm cannot reach a signal-to-noise ratio of 30."""
 SEEDS = 20
-BLOCK = 5
-"""Number of seeds in one test."""
+SEEDS_PER_TEST = 5
 
 
 class Outcome(NamedTuple):
-    """True cross-talk (modes, modes), noise over that of the computed R (modes,), and verdict of a calibration."""
+    """True cross-talk (modes, modes), noise relative to that of the computed R (modes,), and verdict."""
 
     talk: np.ndarray
     noise_ratio: np.ndarray
     verdict: Verdict
 
 
-def true_response(loop: InProcessLoop, first: int, *, closed: bool) -> np.ndarray:
-    """Computed H (pixels, modes) at the mirror's mean shape since frame `first`.
+def true_response(loop: InProcessLoop, first_frame: int, *, closed: bool) -> np.ndarray:
+    """Computed H (pixels, modes) at the mirror's mean shape from frame `first_frame` on.
 
-    In open loop it is averaged over the moving part of the disturbance, too.
+    In open loop, H is also averaged over the moving part of the disturbance.
     """
     before, config, scene = loop.calibration(), loop.config, loop.scene
     optics = factory.twin(config, None, lambda _: None)
     mirror = factory.mirror_on_twin(config, optics, lambda _: None)
-    static_nm = scene._screen + wavefront_nm(mirror, np.mean(loop.surfaces_nm[first:], axis=0).astype(np.float32))
+    static_nm = scene._screen + wavefront_nm(mirror, np.mean(loop.surfaces_nm[first_frame:], axis=0).astype(np.float32))
     frames = () if closed else np.linspace(0, len(loop.surfaces_nm), 32).astype(int)
     moving_nm = [scene._sampler.at(frame)[0] @ scene._basis for frame in frames] or [0.0]
     shapes = np.array(
@@ -73,7 +72,7 @@ def outcome(method: str, preset: str, seed: int, snr: float, folder: Path, modes
     if method == "in-loop":
         loop.close_loop()
         loop.run(200)
-    first = len(loop.surfaces_nm)
+    first_frame = len(loop.surfaces_nm)
     request = CalibrationRequest(method, folder / "night.fits", snr)
     calibrator = Calibrator(loop, request, lambda _: None, lambda *_: None, before)
     with calibrator.required_mode():
@@ -82,12 +81,12 @@ def outcome(method: str, preset: str, seed: int, snr: float, folder: Path, modes
         check = calibrator.check(calibration, data)
     ratio = factory.frame_noise_nm(config, calibration) / computed_noise_nm(config, calibration, before)
     verdict = judge(snr, data.measured.cycles, data.measured.error, check, ratio, calibration.noll)
-    H = true_response(loop, first, closed=method == "in-loop")
+    H = true_response(loop, first_frame, closed=method == "in-loop")
     return Outcome(cross_talk(calibration.reconstructor, H), ratio, verdict)
 
 
 def assert_accurate(result: Outcome, snr: float) -> None:
-    """Expect no faults, cross-talk below 1.2 / snr rms and 4 / snr at most, and noise below 1.5 times the computed."""
+    """Check: no faults, cross-talk below 1.2 / snr rms and 4 / snr at most, noise below 1.5 times the computed R's."""
     assert not result.verdict.faults
     rms, largest = np.sqrt((result.talk**2).mean()), np.abs(result.talk).max()
     assert rms * snr < 1.2
@@ -105,11 +104,11 @@ def test_a_calibration_with_few_cycles_has_the_requested_accuracy(
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-@pytest.mark.parametrize("first_seed", range(1, SEEDS + 1, BLOCK))
+@pytest.mark.parametrize("first_seed", range(1, SEEDS + 1, SEEDS_PER_TEST))
 @pytest.mark.parametrize("preset", REACHABLE)
 @pytest.mark.parametrize("method", ["hadamard", "poke", "in-loop"])
 def test_calibrations_have_the_requested_accuracy(method: str, preset: str, first_seed: int, tmp_path: Path) -> None:
-    for seed in range(first_seed, first_seed + BLOCK):
+    for seed in range(first_seed, first_seed + SEEDS_PER_TEST):
         assert_accurate(outcome(method, preset, seed, 30.0, tmp_path), 30.0)
 
 
@@ -137,8 +136,8 @@ def test_pokes_below_the_disturbance_give_an_error(tmp_path: Path) -> None:
 def test_the_default_calibration_takes_less_than_three_minutes_at_250_hz(tmp_path: Path) -> None:
     loop = InProcessLoop(load(None, {"camera.rate_hz": 250.0}))
     request = CalibrationRequest("hadamard", tmp_path / "night.fits", 70.0)
-    plans = Calibrator(loop, request, lambda _: None, lambda *_: None, loop.calibration()).pokes
-    assert plans.frames(plans.cycles()) / 250 < 180
+    plan = Calibrator(loop, request, lambda _: None, lambda *_: None, loop.calibration()).pokes
+    assert plan.frames(plan.cycles()) / 250 < 180
 
 
 TOML = """
@@ -172,8 +171,8 @@ def test_calibrations_over_the_bus_have_the_requested_accuracy(method: str, pres
     states = [wire.MirrorState.FromString(each.payload) for each in WholeLog([log], topics=(MIRROR_STATE,))]
     scene = InProcessLoop(load(tmp_path / "test.toml"))
     scene.surfaces_nm = [shape for state in states if (shape := actuators(state)) is not None]
-    first = next(row for row, state in enumerate(states) if state.frame_sequence > begun)
-    H = true_response(scene, first, closed=method == "in-loop")
+    first_frame = next(row for row, state in enumerate(states) if state.frame_sequence > begun)
+    H = true_response(scene, first_frame, closed=method == "in-loop")
     calibration = calibration_file.load(tmp_path / "calibration.fits")
     scaled_talk = 30 * cross_talk(calibration.reconstructor, H)
     assert np.sqrt((scaled_talk**2).mean()) < 1.2

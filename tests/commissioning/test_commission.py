@@ -1,4 +1,4 @@
-"""`lowfc commission` on a loop in one process, and the agreement of camera and configuration."""
+"""`lowfc commission` on a loop in one process, and the checks that camera and configuration agree."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -40,11 +40,11 @@ DISTURBED = configured(sensor__modes=3)
 """Few modes, so that a cycle is short; default disturbance."""
 QUIET = configured(sensor__modes=3, disturbance__preset="quiet")
 NOISELESS = configured(sensor__modes=3, disturbance__preset="quiet", camera__noise=False)
-"""For tests that do not depend on noise: a frame takes half the time."""
+"""For tests that do not depend on noise: without noise, computing a frame takes half the time."""
 
 
 class Bench:
-    """A loop without a calibration, and the reports and questions of its commissioning."""
+    """A loop without a calibration, and the results, reports and questions of its commissioning."""
 
     def __init__(self, folder: Path, config: Configuration = QUIET) -> None:
         self.config, self.out = config, folder / "calibration.fits"
@@ -82,7 +82,7 @@ class Bench:
         return results
 
     @property
-    def shown(self) -> str:
+    def report_text(self) -> str:
         return "\n".join(self.reports)
 
 
@@ -120,14 +120,14 @@ def test_commissioning_closes_a_loop_whose_frames_have_another_size_than_the_mod
 
 
 @pytest.mark.parametrize(("scatter", "chosen_nm"), [(0.0, 1.5), (0.2, 3.0)])
-def test_disturbance_of_a_mode_is_not_mistaken_for_nonlinearity(scatter: float, chosen_nm: float) -> None:
-    """The gain of Z3 is 20 % lower for the larger poke; whether that is significant depends on the scatter."""
+def test_a_scatter_of_the_gains_is_not_mistaken_for_nonlinearity(scatter: float, chosen_nm: float) -> None:
+    """The mean gain of Z3 is 20 % lower for the larger poke; whether that is significant depends on the scatter."""
     first, gains = calibration_of(CONFIG.to_toml()), np.ones((4, 14))
     gains[:, 1] = 0.8 + scatter / 2, 0.8 - scatter / 2, 1 + scatter / 2, 1 - scatter / 2
-    answers = iter(gains)
+    gains_of_cycles = iter(gains)
 
     def cycle(*played: object) -> SimpleNamespace:
-        return SimpleNamespace(response=first.response * next(answers))
+        return SimpleNamespace(response=first.response * next(gains_of_cycles))
 
     player: Any = SimpleNamespace(in_use=first, cycle=cycle, report=lambda text: None)
     delay: Any = SimpleNamespace(delay_frames=1.0)
@@ -136,11 +136,12 @@ def test_disturbance_of_a_mode_is_not_mistaken_for_nonlinearity(scatter: float, 
 
 def test_the_loop_holds_the_wavefront_of_the_reference_image(bench: Bench) -> None:
     bench.loop.run(200)
-    true = bench.loop.residual_nm(-200)
-    measured = bench.loop.residual_nm(bench.frames_before["[7/10] response"], bench.frames_before["[8/10] verdict"])
-    assert np.abs(measured.mean(axis=0)).max() > 5, "the reference is far from flat"
-    assert true.mean(axis=0) == pytest.approx(measured.mean(axis=0), abs=1.0)  # the tilts scatter by 3 nm
-    true_error_nm = np.sqrt(true.var(axis=0).sum())
+    closed_nm = bench.loop.residual_nm(-200)
+    begin, end = bench.frames_before["[7/10] response"], bench.frames_before["[8/10] verdict"]
+    reference_nm = bench.loop.residual_nm(begin, end).mean(axis=0)
+    assert np.abs(reference_nm).max() > 5, "the reference is far from flat"
+    assert closed_nm.mean(axis=0) == pytest.approx(reference_nm, abs=1.0)  # the tilts scatter by 3 nm
+    true_error_nm = np.sqrt(closed_nm.var(axis=0).sum())
     assert true_error_nm < bench.results["measured_error_nm"], "the measured error includes noise"
 
 
@@ -163,7 +164,7 @@ def test_without_close_the_residual_is_only_predicted(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("reversed_modes", [[0], [0, 1, 2]])
-def test_a_wrong_sign_fails_the_check_with_automatic_gains(bench: Bench, reversed_modes: list[int]) -> None:
+def test_modes_of_wrong_sign_fail_the_check_of_the_closed_loop(bench: Bench, reversed_modes: list[int]) -> None:
     bench.loop.open_loop()
     good = bench.loop.calibration()
     R = good.reconstructor.copy()
@@ -200,17 +201,18 @@ def test_the_residual_of_a_loaded_linear_law_is_predicted(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(
-    ("snr", "cycles", "required"), [(None, None, 50.0), (None, 6, 20.0), (40.0, None, 40.0), (40.0, 6, 40.0)]
+    ("snr", "cycles", "required_snr"), [(None, None, 50.0), (None, 6, 20.0), (40.0, None, 40.0), (40.0, 6, 40.0)]
 )
-def test_a_given_number_of_cycles_changes_only_the_default_signal_to_noise_ratio(
-    bench: Bench, snr: float | None, cycles: int | None, required: float
+def test_the_default_signal_to_noise_ratio_is_lower_if_the_number_of_cycles_is_set(
+    bench: Bench, snr: float | None, cycles: int | None, required_snr: float
 ) -> None:
     request = bench.commissioning(snr=snr, cycles=cycles)._request()
-    assert (request.snr, request.cycles) == (required, cycles)
+    assert (request.snr, request.cycles) == (required_snr, cycles)
 
 
 @pytest.mark.parametrize(("noise", "poked"), [(0.0, [1]), (0.3, [])], ids=["the configured sensor", "another sensor"])
-def test_tilt_is_poked_to_find_a_reflection_unless_the_sensor_is_another_one(noise: float, poked: list[int]) -> None:
+def test_z3_is_poked_to_find_a_reflection_if_the_image_is_like_the_model(noise: float, poked: list[int]) -> None:
+    """With noise that differs from pixel to pixel, the image is like that of another sensor."""
     config = configured(sensor__kind="clowfs", sensor__modes=3)
     first, geometry = calibration_of(config.to_toml()), Geometry(1.0, 40.2, 39.5, 12.0, -1)
     H = onto(first.response.astype(float).reshape(80, 80, 3), geometry, (80, 80)).reshape(-1, 3)
@@ -230,7 +232,7 @@ def test_a_sensor_unlike_the_configured_one_is_measured_without_the_model(tmp_pa
     """The optical model of another sensor provides only the modes and the mirror's commands."""
     bench = Bench(tmp_path, CONFIG)
     results = bench.commission(model=configured(sensor__kind="clowfs"), close=False, snr=30.0, cycles=None)
-    assert "without the optical model" in bench.shown or "cannot be compared" in bench.shown
+    assert "without the optical model" in bench.report_text or "cannot be compared" in bench.report_text
     assert results["recommended"]
 
 
@@ -250,7 +252,7 @@ def test_a_resumed_commissioning_continues_and_reports_an_operator_who_opens_the
     bench.loop.ask = ask
     bench.loop.ask("release", lease_id=1)
     assert provisional_path(bench.out).exists()
-    assert "without a verdict" in bench.shown
+    assert "without a verdict" in bench.report_text
     assert "has no verdict" in bench.loop.ask("close", lease_id=0).reply
     bench.loop.ask("open", lease_id=0)
     bench.reports.clear()
@@ -263,10 +265,10 @@ def test_a_resumed_commissioning_continues_and_reports_an_operator_who_opens_the
     bench.actions = {"observing": somebody_opens}
     with pytest.raises(CalibrationError, match="the lease ended: operator asked to open"):
         bench.commission(resume=True)
-    assert "[1/10]" not in bench.shown
-    assert "continuing after" in bench.shown
-    assert "the calibration is good" in bench.shown
-    assert "`lowfc ctl gain auto --modes 2,3` makes them automatic again" in bench.shown
+    assert "[1/10]" not in bench.report_text
+    assert "continuing after" in bench.report_text
+    assert "the calibration is good" in bench.report_text
+    assert "`lowfc ctl gain auto --modes 2,3` makes them automatic again" in bench.report_text
     state = bench.loop.status().state
     assert (state.mode, state.calibration_id) == (wire.LOOP_MODE_OPEN, calibration_file.load(bench.out).id)
 
@@ -345,7 +347,7 @@ def configured_camera(config: Configuration) -> wire.CameraState:
 
 
 def faults(config: Configuration, state: wire.CameraState) -> dict[str, Status]:
-    """Statuses of the checks that are not ok, by field or key."""
+    """Statuses of the checks that are not OK, by field of the camera's state or key of the configuration."""
     checks = agreement_checks(config, state)
     return {check.name.split(" ")[0]: check.status for check in checks if check.status is not Status.OK}
 
@@ -358,7 +360,7 @@ def test_the_simulated_camera_agrees_with_its_configuration(em_gain: float, bits
 
 
 @pytest.mark.parametrize("agreement", AGREEMENTS, ids=lambda agreement: agreement.field)
-def test_a_difference_of_camera_and_configuration_is_found(agreement: Agreement) -> None:
+def test_a_difference_between_camera_and_configuration_is_found(agreement: Agreement) -> None:
     state = configured_camera(Configuration())
     setattr(state, agreement.field, 2 * getattr(state, agreement.field))
     status = faults(Configuration(), state)[agreement.field]
@@ -378,13 +380,13 @@ def test_an_existing_calibration_is_replaced_only_with_force(own_runtime: Path) 
     ("rate_hz", "age_ms", "timeout_ms"),
     [(1000, 20, 50), (250, 20, 50), (100, 20, 50), (50, 40, 100), (5, 400, 1000)],
 )
-def test_frame_age_and_timeout_follow_the_rate(rate_hz: float, age_ms: float, timeout_ms: float) -> None:
+def test_the_default_frame_age_and_timeout_depend_on_the_rate(rate_hz: float, age_ms: float, timeout_ms: float) -> None:
     config = Configuration(camera=Camera(rate_hz=rate_hz))
     assert (config.max_frame_age_ns, config.frame_timeout_ns) == (age_ms * 1e6, timeout_ms * 1e6)
     assert "control.frame_timeout_ms" not in faults(config, configured_camera(config))
 
 
-def test_configured_times_apply_and_are_checked() -> None:
+def test_a_configured_frame_age_and_frame_timeout_apply_and_are_checked() -> None:
     config = Configuration(camera=Camera(rate_hz=20.0), control=Control(max_frame_age_ms=7.0, frame_timeout_ms=50.0))
     assert (config.max_frame_age_ns, config.frame_timeout_ns) == (7_000_000, 50_000_000)
     assert faults(config, configured_camera(config)) == {"control.frame_timeout_ms": Status.WRONG}

@@ -1,4 +1,4 @@
-"""Configured flat map, active actuators, control law and registration error, from the files to the mirror."""
+"""Effect of the configured flat map, active actuators, control law and registration error on the mirror."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -38,6 +38,7 @@ def calibration() -> Calibration:
 
 
 def wavy(height_nm: float = 30.0) -> Single:
+    """A shape of the mirror (rows, columns) with waves, nm of surface."""
     rows, columns = np.indices(GRID)
     return (height_nm * np.sin(rows / 2) * np.cos(columns / 3)).astype(np.float32)
 
@@ -57,7 +58,8 @@ def law_of(config: Configuration, gain: float = 0.2, signal: Signal = "pol") -> 
     return law_from_blocks(blocks, signal, "leaky", config.noll, delay_frames, config.camera.rate_hz)
 
 
-def complaint(overrides: dict[str, Any]) -> str:
+def file_error(overrides: dict[str, Any]) -> str:
+    """The error of the check of a configuration's files and gains."""
     with pytest.raises(ConfigurationError) as caught:
         check_files(load(None, overrides))
     return str(caught.value)
@@ -65,7 +67,7 @@ def complaint(overrides: dict[str, Any]) -> str:
 
 @pytest.mark.parametrize("key", ["control.tilt_gain", "control.gain"])
 def test_gains_with_which_the_loop_is_unstable_are_refused(key: str) -> None:
-    assert complaint({key: 1.0, "control.delay_frames": 2.0}).startswith(f"{key}: gain must be at least 0 and below 1")
+    assert file_error({key: 1.0, "control.delay_frames": 2.0}).startswith(f"{key}: gain must be at least 0 and below 1")
     with pytest.raises(ConfigurationError, match="got 3"):
         StartUp(load(None, {key: 3.0}))
 
@@ -87,12 +89,12 @@ def test_an_invalid_map_gives_an_error_of_one_line(tmp_path: Path) -> None:
     fits.HDUList([fits.PrimaryHDU()]).writeto(tmp_path / "empty.fits")
     saved(tmp_path, "line.npy", np.zeros(9))
     saved(tmp_path, "cube.npy", np.zeros((2, 3, 4)))
-    saved(tmp_path, "words.npy", np.array([["flat"]]))
+    saved(tmp_path, "text.npy", np.array([["flat"]]))
     saved(tmp_path, "nothing.npy", np.zeros((0, 34)))
     np.save(tmp_path / "pickle.npy", np.array([[{}]], dtype=object))
     for file, why in {
         **dict.fromkeys(("short.fits", "archive.npy", "pickle.npy"), "neither"),
-        **dict.fromkeys(("line.npy", "words.npy", "nothing.npy"), "is an array"),
+        **dict.fromkeys(("line.npy", "text.npy", "nothing.npy"), "is an array"),
         "cube.npy": r"\(2, 3, 4\) of float64",
         **dict.fromkeys(("none.fits", "none.npy"), "there is no such file"),
         "empty.fits": "there is no image",
@@ -116,29 +118,29 @@ def test_the_flat_map_is_zero_where_no_actuator_is_active(tmp_path: Path) -> Non
 def test_the_error_has_one_line_for_each_unusable_file(tmp_path: Path) -> None:
     config = load(None)
     small, tall = saved(tmp_path, "small.npy", np.ones((5, 6))), saved(tmp_path, "tall.npy", wavy(900.0))
-    assert complaint({"mirror.flat": small}).endswith("5 x 6 values, the mirror has 34 x 34 actuators")
-    assert "there is no such file" in complaint({"mirror.active": str(tmp_path / "none.fits")})
-    assert "0 or 1" in complaint({"mirror.active": tall})
-    assert "no actuator is active" in complaint({"mirror.active": saved(tmp_path, "none.npy", np.zeros(GRID))})
-    assert "finite" in complaint({"mirror.flat": saved(tmp_path, "nan.npy", np.full(GRID, np.nan))})
-    assert "beyond the limits of [safety]: stroke, neighbour" in complaint({"mirror.flat": tall})
+    assert file_error({"mirror.flat": small}).endswith("5 x 6 values, the mirror has 34 x 34 actuators")
+    assert "there is no such file" in file_error({"mirror.active": str(tmp_path / "none.fits")})
+    assert "0 or 1" in file_error({"mirror.active": tall})
+    assert "no actuator is active" in file_error({"mirror.active": saved(tmp_path, "none.npy", np.zeros(GRID))})
+    assert "finite" in file_error({"mirror.flat": saved(tmp_path, "nan.npy", np.full(GRID, np.nan))})
+    assert "beyond the limits of [safety]: stroke, neighbour" in file_error({"mirror.flat": tall})
     law = tmp_path / "law.fits"
     law_file.save(law_of(config), law)
     check_files(load(None, {"control.law": str(law)}))
-    assert "Z2 to Z15" in complaint({"control.law": str(law), "sensor.modes": 9})
-    assert "made for 250 Hz, the frames come at 500 Hz" in complaint({"control.law": str(law), "camera.rate_hz": 500})
-    assert "was made for a delay of 1 frame, the loop has 3" in complaint(
+    assert "Z2 to Z15" in file_error({"control.law": str(law), "sensor.modes": 9})
+    assert "made for 250 Hz, the frames come at 500 Hz" in file_error({"control.law": str(law), "camera.rate_hz": 500})
+    assert "was made for a delay of 1 frame, the loop has 3" in file_error(
         {"control.law": str(law), "control.delay_frames": 3}
     )
     law_file.save(law_of(config, gain=0.95, signal="error"), law)
     check_files(load(None, {"control.law": str(law)}))
-    assert "unstable with a delay of 3" in complaint({"control.law": str(law), "control.delay_frames": 3})
-    several = complaint({"mirror.flat": small, "control.law": small, "sensor.sam": "none.json"}).splitlines()
-    assert len(several) == 3
-    assert all(text in line for text, line in zip(("none.json", "mirror.flat", "control.law"), several, strict=True))
+    assert "unstable with a delay of 3" in file_error({"control.law": str(law), "control.delay_frames": 3})
+    lines = file_error({"mirror.flat": small, "control.law": small, "sensor.sam": "none.json"}).splitlines()
+    assert len(lines) == 3
+    assert all(text in line for text, line in zip(("none.json", "mirror.flat", "control.law"), lines, strict=True))
 
 
-def test_inactive_actuators_get_no_command_and_each_mode_is_still_read_back_exactly(
+def test_inactive_actuators_get_no_command_and_each_mode_is_still_recovered_exactly(
     tmp_path: Path, calibration: Calibration
 ) -> None:
     """Five inactive actuators in the pupil: the product ACT2MODES MODES2ACT remains the identity."""
@@ -164,13 +166,13 @@ def test_a_registration_error_affects_the_mirror_but_not_the_computed_calibratio
     np.testing.assert_array_equal(computed.modes_to_actuators, calibration.modes_to_actuators)
     poked = (20.0 * calibration.modes_to_actuators[:, 2]).reshape(GRID)  # defocus
     aligned = scene(load(None, QUIET)).truth(0, poked).sampled.residual_nm
-    moved = scene(config).truth(0, poked).sampled.residual_nm
+    shifted = scene(config).truth(0, poked).sampled.residual_nm
     assert aligned[2] == pytest.approx(20, rel=0.01)
     assert abs(aligned[0]) < 0.1
-    assert 19 < moved[2] < 19.9, "magnification reduces the defocus in the pupil"
-    # dZ4/dx = 2 sqrt(3) Z2 over the circle, and the shift is 2 x 0.31 / 31 radii.
-    assert moved[0] == pytest.approx(-20 * 2 * np.sqrt(3) * 2 * 0.31 / 31, rel=0.1)
-    assert moved[1] == pytest.approx(moved[0], rel=0.05)
+    assert 19 < shifted[2] < 19.9, "magnification reduces the defocus in the pupil"
+    # dZ4/dx = 2 sqrt(3) Z2 on the unit circle, and the shift is 2 x 0.31 / 31 radii of the pupil.
+    assert shifted[0] == pytest.approx(-20 * 2 * np.sqrt(3) * 2 * 0.31 / 31, rel=0.1)
+    assert shifted[1] == pytest.approx(shifted[0], rel=0.05)
 
 
 def started(config: Configuration, calibration: Calibration, shape: MirrorShape | None) -> tuple[State, list[Request]]:
@@ -209,15 +211,15 @@ def test_the_flat_map_is_applied_at_the_start(tmp_path: Path, calibration: Calib
     assert not StartUp(load(None)).requests(state, 0)
 
 
-@pytest.mark.parametrize("age_s", [1, 6])
-def test_the_flat_map_is_applied_during_a_permit_that_began_before_the_mirror_reported(
-    tmp_path: Path, calibration: Calibration, age_s: int
+@pytest.mark.parametrize("permit_age_s", [1, 6])  # the permit lasts 5 s
+def test_the_flat_map_is_applied_during_and_after_a_permit_that_began_before_the_mirror_reported(
+    tmp_path: Path, calibration: Calibration, permit_age_s: int
 ) -> None:
     """If the request were refused, the controller would end, as it does not run without its configured flat map."""
     config = load(None, {"mirror.flat": saved(tmp_path, "flat.npy", wavy(120.0))})
     settings = factory.settings(config)
     state, _ = feed(settings, State(), Load(0, calibration, "test"), PERMIT)
-    (request,) = StartUp(config).requests(state, age_s * 10**9)
+    (request,) = StartUp(config).requests(state, permit_age_s * 10**9)
     assert advance(settings, state, request)[1].reply.accepted
 
 
@@ -234,8 +236,8 @@ def test_a_permit_holds_the_flat_map_of_a_closed_loop_whose_mirror_reports_late(
     assert (state.mode, outputs.step.reasons) == (LoopMode.CLOSED, (Rejection.HELD,))
     np.testing.assert_array_equal(outputs.command.actuators_nm, flat)
     state, _ = advance(settings, state, Request(5, "release", lease_id=7))
-    moved, names = commands(config, state._replace(frame_sequence=0), 2)
-    assert (names, np.abs(moved[-1]).max() > 40) == ([FLAT], True)
+    sent, names = commands(config, state._replace(frame_sequence=0), 2)
+    assert (names, np.abs(sent[-1]).max() > 40) == ([FLAT], True)
 
 
 @pytest.mark.parametrize("command_reported", [True, False])
@@ -269,7 +271,7 @@ def test_the_configured_law_is_requested_at_the_start(tmp_path: Path, calibratio
 
 
 def test_a_controller_does_not_start_without_a_configured_file(tmp_path: Path) -> None:
-    """It ends with an error of one line."""
+    """The process ends with an error of one line."""
     done = run(tmp_path, "controller", "--run", "lawless", config='[control]\nlaw = "none.fits"\n', timeout_s=30)
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1].startswith("error: control.law: none.fits: there is no such law file")

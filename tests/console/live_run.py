@@ -1,4 +1,4 @@
-"""A run in one process, in real time: real controller and mirror, toy sensor, a stand-in for the recorder."""
+"""A run in one process, in real time: lowfc's controller and simulated mirror, a toy sensor, and a fake recorder."""
 
 import time
 from dataclasses import replace
@@ -38,15 +38,15 @@ class LiveRun(ThreadedRun):
     """A run whose controller, mirror and camera are threads of this process.
 
     Attributes:
-        requests: requests as published by the controller, without those that a console sends at its start.
-        recorded: names of the requests to the recorder.
+        requests: requests as published by the controller, without `configuration`, which a console sends at its start.
+        recorder_requests: names of the requests to the recorder.
     """
 
     def __init__(self, folder: Path) -> None:
         self.clock = HostClock()
         super().__init__(RUN, CONFIG, lambda: self.clock)
         self.requests: list[wire.Request] = []
-        self.recorded: list[str] = []
+        self.recorder_requests: list[str] = []
         monitor = self.bus("monitor")
         monitor.subscribe(REQUEST, self._add_request)
         mirror_states: list[object] = []
@@ -77,6 +77,6 @@ class LiveRun(ThreadedRun):
         self.camera.finish()
 
     def _record(self, query: Query) -> None:
-        self.recorded.append(query.name)
+        self.recorder_requests.append(query.name)
         answer = wire.Request(name=query.name, accepted=True, reply=f"{query.name}: night.mcap", text="night.mcap")
         query.reply(answer.SerializeToString())

@@ -182,7 +182,7 @@ def test_the_key_of_every_button_sends_its_request(
         assert not screen.form_is_open(), "a form closes when its request is accepted"
     laws = [request for request in run.requests if request.name == "law"]
     assert [law.HasField("law") for law in laws] == [True, False]
-    assert run.recorded == ["stop", "start", "stop"]
+    assert run.recorder_requests == ["stop", "start", "stop"]
     screen.until(lambda: "pause (" in screen.text("log"))
     line = next(line for line in screen.text("log").splitlines() if "pause (" in line)
     assert f"(process {os.getpid()}))" in line
