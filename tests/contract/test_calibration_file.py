@@ -92,20 +92,20 @@ def test_files_of_another_kind_are_refused(tmp_path: Path) -> None:
         load(tmp_path / "none.fits")
 
 
-def test_the_identity_depends_on_every_field() -> None:
+def test_the_identity_depends_on_every_field_but_not_on_the_start_of_the_camera() -> None:
     original = calibration()
     assert calibration_codec.with_identity(original).id == original.id
     assert len(original.id) == 64
-    added: dict[str, Any] = {"camera": toy.CAMERA, "actuators_to_modes": np.zeros((3, 20), np.float32)}
+    absent_before: dict[str, Any] = {"camera": toy.CAMERA, "actuators_to_modes": np.zeros((3, 20), np.float32)}
     for name in {field.name for field in fields(Calibration)} - {"id"}:
-        value = added.get(name, getattr(original, name))
-        changed = value if name in added else value[::-1] if isinstance(value, str | tuple) else value + 1
+        value = absent_before.get(name, getattr(original, name))
+        changed = value if name in absent_before else value[::-1] if isinstance(value, str | tuple) else value + 1
         assert calibration_codec.with_identity(replace(original, **{name: changed})).id != original.id, name
     cameras = toy.CAMERA, replace(toy.CAMERA, time_ns=77, start_s=8)  # another start of the same camera
     assert len({calibration_codec.with_identity(replace(original, camera=camera)).id for camera in cameras}) == 1
 
 
-def test_actuators_to_modes_are_stored_and_optional(tmp_path: Path) -> None:
+def test_the_matrix_from_actuators_to_modes_is_optional(tmp_path: Path) -> None:
     without_matrix, path = calibration(), tmp_path / "night.fits"
     matrix = np.arange(60, dtype=np.float32).reshape(3, 20)
     with_matrix = calibration_codec.with_identity(replace(without_matrix, actuators_to_modes=matrix))

@@ -60,7 +60,7 @@ and one at the margin."""
         second: int = Field(2, description="Declared.")
 
 
-def test_a_class_within_a_class_has_descriptions_and_one_without_source_has_empty_ones() -> None:
+def test_keys_of_a_nested_class_have_descriptions_and_own_keys_of_a_class_without_source_have_none() -> None:
     inherited = InterlockSection.descriptions()
     own = {"first": "One line,\nand one at the margin.", "second": "Declared."}
     assert Outer.Options.descriptions() == inherited | own
@@ -71,16 +71,16 @@ def test_a_class_within_a_class_has_descriptions_and_one_without_source_has_empt
 def test_a_configuration_round_trips_through_toml(tmp_path: Path) -> None:
     config = load(None, {"seed": 7, "mirror.stuck_nm": {"3": 25.0}, "mirror.dead": [1, 2], "camera.delay_frames": 1.5})
     assert load(write(tmp_path, config.to_toml())) == config
-    many = load(None, {"mirror.stuck_nm": {str(actuator): 0.5 for actuator in range(150)}})
-    assert load(write(tmp_path, commented(many))) == many, "a line of 150 floats is read back too"
+    long_line = load(None, {"mirror.stuck_nm": {str(actuator): 0.5 for actuator in range(150)}})
+    assert load(write(tmp_path, commented(long_line))) == long_line, "a line of 150 floats is read back too"
     options = {"tables": [{"a b": 1.5}, {"c": [[1, 2], []]}], "text": 'quoted "\n', "none": {}}
-    odd = load(None, {"drivers": {"own": options}, "recorder.on_event": "a\N{LINE SEPARATOR}b"})
-    assert load(write(tmp_path, commented(odd))) == load(write(tmp_path, odd.to_toml())) == odd
+    unusual = load(None, {"drivers": {"own": options}, "recorder.on_event": "a\N{LINE SEPARATOR}b"})
+    assert load(write(tmp_path, commented(unusual))) == load(write(tmp_path, unusual.to_toml())) == unusual
     assert tomllib.loads(config.to_toml()) == config.model_dump(), "every key is written"
 
 
 @pytest.mark.parametrize(
-    ("text", "unknown", "near"),
+    ("text", "unknown", "nearest"),
     [
         ("[camera]\nrate_hertz = 500", "camera.rate_hertz", "camera.rate_hz"),
         ("[control]\ntiltgain = 0.5", "control.tiltgain", "control.tilt_gain"),
@@ -92,11 +92,11 @@ def test_a_configuration_round_trips_through_toml(tmp_path: Path) -> None:
     ],
 )
 def test_an_unknown_key_is_refused_with_the_nearest_known_one(
-    tmp_path: Path, text: str, unknown: str, near: str
+    tmp_path: Path, text: str, unknown: str, nearest: str
 ) -> None:
     path = write(tmp_path, text)
     message = error_of(path)
-    assert message.startswith(f"{path}: unknown key {unknown!r}; the nearest known one is '{near}'")
+    assert message.startswith(f"{path}: unknown key {unknown!r}; the nearest known one is '{nearest}'")
     assert "\n" not in message
 
 
@@ -155,7 +155,7 @@ def test_a_gateway_has_no_more_bench_values_than_a_recorder_records() -> None:
     assert load(None, {"gateway.bench": variables}).gateway.bench == variables
 
 
-def test_each_fault_of_a_value_of_several_types_names_its_key() -> None:
+def test_each_error_line_of_a_key_that_accepts_several_types_names_the_key() -> None:
     lines = error_of(None, {"interlocks": [{"name": "mask", "action": "hold", "value": [1]}]}).splitlines()
     assert len(lines) == 3
     assert {line.partition(" = ")[0] for line in lines} == {"interlocks.0.value"}
@@ -173,7 +173,7 @@ def test_each_fault_of_a_value_of_several_types_names_its_key() -> None:
         ),
     ],
 )
-def test_an_impossible_address_of_the_router_is_refused(key: str, address: str, message: str) -> None:
+def test_an_invalid_address_of_the_router_is_refused(key: str, address: str, message: str) -> None:
     keys = {"network.router": "tls/[::1]:7447", "network.certificates": "certs"}
     assert load(None, keys).network.address == ("::1", 7447)
     error = error_of(None, {**keys, f"network.{key}": address})

@@ -22,18 +22,18 @@ from tests.support.report_log import SyntheticLog
 from tests.support.stage import Tape
 
 HOSTILE = "clouds\x1b[2J\x07 \x9b31mred \u202egnorts \u2028 caf\u00e9 5\u2009nm\r\nerror: fine"
-SHOWN = r"clouds\x1b[2J\x07 \x9b31mred \u202egnorts \u2028 café 5" + "\u2009" + r"nm\r\nerror: fine"
+ESCAPED = r"clouds\x1b[2J\x07 \x9b31mred \u202egnorts \u2028 café 5" + "\u2009" + r"nm\r\nerror: fine"
 
 
-def check(output: str, *, keep: str = "\n") -> None:
+def assert_escaped(output: str, *, keep: str = "\n") -> None:
     """Assert that the output contains the hostile text, but none of its control characters."""
     assert printable(output, keep) == output
     assert "clouds\\x1b[2J" in output
 
 
 def test_only_control_characters_are_escaped() -> None:
-    assert printable(HOSTILE) == SHOWN
-    assert printable(HOSTILE, LINES) == SHOWN.replace("\\n", "\n")
+    assert printable(HOSTILE) == ESCAPED
+    assert printable(HOSTILE, LINES) == ESCAPED.replace("\\n", "\n")
     harmless = "R = 3 µm, \u00a0 ±2 \\n 日本 🔭 \u2009"
     assert printable(harmless) == harmless
     assert printable("a\udc80b") == r"a\udc80b"
@@ -41,7 +41,7 @@ def test_only_control_characters_are_escaped() -> None:
 
 def test_a_process_escapes_its_events(capsys: pytest.CaptureFixture[str]) -> None:
     Listener(FakeClock()).service("camera").event("RECORDING_FAILED", why=HOSTILE)
-    assert capsys.readouterr().err == f"camera: RECORDING_FAILED recording stopped: {SHOWN}\n"
+    assert capsys.readouterr().err == f"camera: RECORDING_FAILED recording stopped: {ESCAPED}\n"
 
 
 @pytest.mark.usefixtures("restored_signals")
@@ -50,7 +50,7 @@ def test_a_command_escapes_its_output_and_errors(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, fault: Exception
 ) -> None:
     print_result({}, f"{HOSTILE}\nframe 3", as_json=False)
-    check(capsys.readouterr().out)
+    assert_escaped(capsys.readouterr().out)
     failing = new_app("")
 
     @failing.command()
@@ -60,13 +60,13 @@ def test_a_command_escapes_its_output_and_errors(
     monkeypatch.setattr(sys, "argv", ["lowfc"])
     with pytest.raises(SystemExit):
         run_app(failing)
-    check(capsys.readouterr().err)
+    assert_escaped(capsys.readouterr().err)
 
 
 def test_configuration_errors_are_escaped() -> None:
     with pytest.raises(ConfigurationError) as caught:
         load(None, {"mirror.stuck_nm": {HOSTILE: "high"}})
-    check(str(caught.value))
+    assert_escaped(str(caught.value))
 
 
 @pytest.fixture(scope="module")
@@ -87,10 +87,10 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_readers_of_a_log_escape_their_output(log: Path, command: str) -> None:
     done = lowfc(command, log)
     assert done.exit_code == 0, done.output
-    check(done.output)
+    assert_escaped(done.output)
     if command == "report":
         page = log.with_suffix(".html").read_text()
-        check(page, keep=LINES)
+        assert_escaped(page, keep=LINES)
         assert page.count("clouds\\x1b[2J") >= 6, "in events, requests and versions"
 
 

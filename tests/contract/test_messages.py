@@ -27,7 +27,7 @@ WIRE = ROOT / "lowfc" / "contract" / "wire"
 GOLDEN = Path(__file__).parents[1] / "golden" / "lowfc_v1.txt"
 
 
-def declared() -> FileDescriptorProto:
+def declared_package() -> FileDescriptorProto:
     """The package lowfc.v1 in the committed descriptor, with comments."""
     descriptors = FileDescriptorSet.FromString((WIRE / "lowfc.desc").read_bytes())
     return next(file for file in descriptors.file if file.package == "lowfc.v1")
@@ -42,7 +42,7 @@ def comments(file: FileDescriptorProto) -> dict[tuple[int, ...], str]:
 
 def schema() -> list[str]:
     """One line for each field and each enum value: message, number, name, type, label, comment."""
-    file, lines = declared(), []
+    file, lines = declared_package(), []
     sentences = comments(file)
     for index, message in enumerate(file.message_type):
         for position, field in enumerate(message.field):
@@ -58,7 +58,7 @@ def schema() -> list[str]:
 
 
 def test_the_schema_only_grows() -> None:
-    """Each change shows in the golden file; tests/logs/test_golden.py compares the schema with that of version 0.1."""
+    """The golden file shows each change; tests/logs/test_golden.py compares the schema with that of version 0.1."""
     assert GOLDEN.read_text(encoding="utf-8").splitlines() == schema(), (
         "the schema has changed: existing numbers, names, types and labels must stay, and a new field needs a new "
         f"number; if they do, run `python {Path(__file__).relative_to(ROOT)}` and commit the golden file"
@@ -87,7 +87,7 @@ def test_levels_have_the_numbers_of_foxgloves_schema() -> None:
 
 
 def test_every_message_and_every_field_has_a_comment() -> None:
-    file = declared()
+    file = declared_package()
     sentences = comments(file)
     without_comment = [message.name for index, message in enumerate(file.message_type) if not sentences.get((4, index))]
     without_comment += [
@@ -165,7 +165,7 @@ def test_every_event_raised_by_its_literal_name_is_in_the_table_with_the_same_de
 
 
 @pytest.mark.parametrize("name", ["LIMIT_HIT", "LIMIT_CLEARED"])
-def test_the_events_of_a_limit_are_also_true_of_modal_limits(name: str) -> None:
+def test_the_text_of_limit_events_is_also_true_of_modal_limits(name: str) -> None:
     message = EVENTS[name].log("controller", 0, reason=Limit.MODAL_LIMIT.name).message
     assert "mirror" not in message
     assert message.endswith(": MODAL_LIMIT")

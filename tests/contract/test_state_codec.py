@@ -21,8 +21,8 @@ from tests.support.toy import CAMERA, feed, frame, loaded, settings
 def test_a_state_without_a_calibration_round_trips() -> None:
     setup = settings()
     state, _ = advance(setup, State(), frame(3))
-    decoded, resumed = decode_state(controller_state(state, setup, 1), None)
-    assert (decoded, resumed) == (setup, state._replace(counts=dict(state.counts)))
+    decoded_settings, decoded_state = decode_state(controller_state(state, setup, 1), None)
+    assert (decoded_settings, decoded_state) == (setup, state._replace(counts=dict(state.counts)))
 
 
 def test_a_state_with_the_wrong_calibration_is_refused() -> None:

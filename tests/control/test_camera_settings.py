@@ -154,7 +154,7 @@ def test_a_frame_from_the_future_does_not_change_the_newest_sequence() -> None:
     assert after.step.reasons == ()
 
 
-def test_commands_report_safe_mode_and_a_restarted_controller_takes_it_over_from_the_mirror() -> None:
+def test_commands_carry_safe_mode_to_the_mirror_and_a_restarted_controller_adopts_it_from_there() -> None:
     state, _ = ask(loaded(DEFAULTS), "safe")
     _, (outputs,) = feed(DEFAULTS, state, frame(1))
     assert outputs.command.safe
@@ -184,7 +184,7 @@ def misfit_frame(count: int) -> Frame:
 
 
 def idle(shape_nm: float = 0.0) -> State:
-    """A controller without a calibration, whose mirror has reported its shape."""
+    """A controller without a calibration, after the first report of the mirror's shape and three frames."""
     actuators = np.full(GRID, shape_nm, np.float32)
     state, _ = feed(DEFAULTS, State(), MirrorShape(0, actuators, np.zeros(0, np.float32)))
     return feed(DEFAULTS, state, *(misfit_frame(count) for count in range(1, 4)))[0]
@@ -316,12 +316,14 @@ def test_a_frame_timeout_ends_the_probe_sequence() -> None:
     assert names(feed(replace(DEFAULTS, on_frame_timeout="hold"), state, tick)[1]) == []
 
 
-@pytest.mark.parametrize(("rows", "request_", "events"), [(5, "status", 1), (5, "stop", 0), (1, "status", 0)])
-def test_a_probe_sequence_that_ends_early_raises_one_event(rows: int, request_: str, events: int) -> None:
+@pytest.mark.parametrize(("rows", "request_name", "events"), [(5, "status", 1), (5, "stop", 0), (1, "status", 0)])
+def test_a_probe_sequence_raises_one_event_only_if_it_ends_early_and_without_a_request(
+    rows: int, request_name: str, events: int
+) -> None:
     restarted = frame(0, pixels=MISFIT_IMAGE, sequence=frame_sequence(0, START + 60))
-    ends = Tick(0, DEFAULTS.frame_timeout_ns + 1), MirrorReport(0, "does not answer"), restarted
+    causes_of_end = Tick(0, DEFAULTS.frame_timeout_ns + 1), MirrorReport(0, "does not answer"), restarted
     state = play(idle(), np.ones((rows, 1), np.float32))
-    _, all_outputs = feed(DEFAULTS, state, misfit_frame(4), Request(0, request_), *ends)
+    _, all_outputs = feed(DEFAULTS, state, misfit_frame(4), Request(0, request_name), *causes_of_end)
     assert "CAMERA_RESTARTED" in names(all_outputs)
     assert names(all_outputs).count("PLAY_ENDED") == events
 

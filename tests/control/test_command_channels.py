@@ -19,7 +19,7 @@ from tests.support.theory import law_of, linear
 from tests.support.toy import CAMERA, GRID, NOLL, START, TOY, calibration, frame, frame_sequence, loaded, settings
 
 DEFAULTS = settings()
-DISTURBED = np.array([10.0, -5.0, 3.0])
+DISTURBANCE_NM = np.array([10.0, -5.0, 3.0])
 ACTUATORS = GRID[0] * GRID[1]
 STEP_NM = DEFAULTS.limits.kept_slew_nm / 2
 """Largest move of a channel in a frame: half the slew limit with its margin."""
@@ -30,7 +30,7 @@ LOAD_OTHER = Request(0, "load", calibration=replace(calibration(scale=1.01), id=
 
 
 class ToyLoop:
-    """A loop with the sensor and the mirror of `TOY`: a command is seen after the delay of its settings."""
+    """A loop with the sensor and the mirror of `TOY`; the sensor sees a command after the delay of the settings."""
 
     def __init__(self, setup: Settings = DEFAULTS, mode: LoopMode = LoopMode.CLOSED) -> None:
         self.setup = replace(setup, start_mode=mode)
@@ -48,18 +48,18 @@ class ToyLoop:
             self.surfaces.append(outputs.command.actuators_nm)
         return outputs
 
-    def run(self, frames: int, disturbance_nm: npt.ArrayLike = DISTURBED) -> None:
-        """Run frames with this wavefront (modes,) plus the shape of the mirror."""
+    def run(self, frames: int, disturbance_nm: npt.ArrayLike = DISTURBANCE_NM) -> None:
+        """Run frames whose wavefront is this disturbance (modes,), nm rms, plus the shape of the mirror."""
         for _ in range(frames):
             self.count += 1
-            places = [max(-1 - lag, -len(self.surfaces)) for lag in range(len(self.weights))]
-            shape_nm = np.tensordot(self.weights, [self.surfaces[place] for place in places], 1)
+            indices = [max(-1 - lag, -len(self.surfaces)) for lag in range(len(self.weights))]
+            shape_nm = np.tensordot(self.weights, [self.surfaces[index] for index in indices], 1)
             seen_nm = np.asarray(disturbance_nm) + self.to_modes @ shape_nm.reshape(-1)
             self.wavefronts.append(seen_nm)
             self.process_input(frame(self.count, seen_nm))
 
     def ask(self, name: str, **fields: object) -> Reply:
-        """Send a request as an operator: encoded and decoded."""
+        """Send a request encoded and decoded, as over the bus."""
         request = Request(0, name, **fields)
         payload = encode_request(request, Reply(False, "", 0), 0, None)
         return self.process_input(decode_request(payload, name, 0)).reply
@@ -70,6 +70,7 @@ class ToyLoop:
 
 
 def dark_hole(scale_nm: float = 20.0, seed: int = 5) -> Single:
+    """A random shape of the mirror, nm of surface."""
     return (scale_nm * np.random.default_rng(seed).standard_normal(GRID)).astype(np.float32)
 
 
@@ -110,7 +111,7 @@ def test_an_external_shape_is_neither_undone_nor_commanded() -> None:
     loop.run(40)
     before = loop.surfaces[-1]
     assert loop.ask("channel", text=EXTERNAL, actuators_nm=external).accepted
-    seen_nm = DISTURBED + loop.to_modes @ external.reshape(-1)
+    seen_nm = DISTURBANCE_NM + loop.to_modes @ external.reshape(-1)
     loop.run(20, seen_nm)
     assert np.allclose(loop.surfaces[-1], before, atol=0.02)
     assert max(np.abs(surface - before).max() for surface in loop.surfaces[-20:]) < 0.02  # no transient
@@ -227,11 +228,11 @@ def test_a_request_a_limit_a_camera_restart_or_another_calibration_ends_a_probe_
 def test_an_inconsistent_probe_sequence_is_refused(fields: dict[str, object], why: str) -> None:
     loop = ToyLoop()
     loop.run(2)
-    single = {
+    float32_fields = {
         name: value.astype(np.float32) if isinstance(value, np.ndarray) else value for name, value in fields.items()
     }
     before = loop.state
-    reply = loop.ask("play", **single)
+    reply = loop.ask("play", **float32_fields)
     assert not reply.accepted
     assert why in reply.text
     assert loop.state.loop is before.loop
@@ -304,10 +305,10 @@ def test_the_loop_opens_after_the_last_step() -> None:
 @pytest.mark.parametrize("mode", [LoopMode.OPEN, LoopMode.CLOSED])
 def test_reset_removes_the_modal_command_within_the_slew_limit(mode: LoopMode) -> None:
     loop = ToyLoop(replace(DEFAULTS, limits=Limits(700.0, 2.0, 400.0)))
-    loop.run(100, 3 * DISTURBED)
+    loop.run(100, 3 * DISTURBANCE_NM)
     channel = dark_hole(10.0)
     loop.ask("channel", text="dark-hole", actuators_nm=channel)
-    loop.run(100, 3 * DISTURBED)
+    loop.run(100, 3 * DISTURBANCE_NM)
     if mode is LoopMode.OPEN:
         loop.ask("open")
     assert loop.ask("reset").accepted
@@ -315,22 +316,22 @@ def test_reset_removes_the_modal_command_within_the_slew_limit(mode: LoopMode) -
     start = len(loop.surfaces)
     while loop.state.returning_to_zero:
         assert len(loop.surfaces) < start + 100
-        loop.run(1, 3 * DISTURBED)
+        loop.run(1, 3 * DISTURBANCE_NM)
     assert len(loop.surfaces) > start + 3  # the slew limit is small
     assert np.allclose(loop.surfaces[-1], channel, atol=0.01)
     assert np.abs(np.diff(loop.surfaces, axis=0)).max() <= 2.0
-    loop.run(5, 3 * DISTURBED)
+    loop.run(5, 3 * DISTURBANCE_NM)
     assert np.allclose(loop.surfaces[-1], channel, atol=0.01) is (mode is LoopMode.OPEN)
 
 
 def test_a_shape_that_the_loop_did_not_command_is_adopted_as_a_channel() -> None:
     loop = ToyLoop()
-    shape_nm = dark_hole(30.0) + (TOY.modes_to_actuators @ DISTURBED).reshape(GRID).astype(np.float32)
+    shape_nm = dark_hole(30.0) + (TOY.modes_to_actuators @ DISTURBANCE_NM).reshape(GRID).astype(np.float32)
     loop.process_input(MirrorShape(0, shape_nm, np.zeros(0, np.float32)))
     assert "SHAPE_ADOPTED" in loop.events
     loop.surfaces = [shape_nm]
     seen = loop.to_modes @ shape_nm.reshape(-1)
-    loop.run(40, -seen + DISTURBED)  # the wavefront is well corrected, except for this disturbance
+    loop.run(40, -seen + DISTURBANCE_NM)  # the mirror's shape corrects all of the wavefront but DISTURBANCE_NM
     assert np.abs(np.diff(loop.surfaces, axis=0)).max() < 20
     assert [channel.name for channel in loop.state.loop.command_channels.channels] == [ADOPTED]
     moved_nm = loop.surfaces[-1] - shape_nm
@@ -339,21 +340,21 @@ def test_a_shape_that_the_loop_did_not_command_is_adopted_as_a_channel() -> None
 
 
 def test_a_law_takes_over_and_returns_control_without_a_jump() -> None:
-    """The linear law equals the integrator: with either, the mirror moves in the same way within 0.5 nm."""
-    loop, plain = ToyLoop(), ToyLoop()
-    for each in (loop, plain):
+    """The linear law equals the integrator: with and without it, the mirror's shapes agree within 0.5 nm."""
+    loop, without_law = ToyLoop(), ToyLoop()
+    for each in (loop, without_law):
         each.ask("gain", values=(0.4,))
         each.ask("limit", values=(50.0,))
     assert loop.ask("law", law=linear(law_of(0.4))).accepted
     assert not loop.ask("gain", values=(0.3,)).accepted
     frames = SETTLING_FRAMES + FADING_FRAMES + 50
-    for each in (loop, plain):
+    for each in (loop, without_law):
         each.run(frames)
-    assert np.allclose(loop.surfaces[-1], plain.surfaces[-1], atol=0.01)
-    assert np.abs(np.subtract(loop.surfaces, plain.surfaces)).max() < 0.5
+    assert np.allclose(loop.surfaces[-1], without_law.surfaces[-1], atol=0.01)
+    assert np.abs(np.subtract(loop.surfaces, without_law.surfaces)).max() < 0.5
     assert loop.ask("law").accepted
     loop.run(5)
-    assert np.allclose(loop.surfaces[-1], plain.surfaces[-1], atol=0.05)
+    assert np.allclose(loop.surfaces[-1], without_law.surfaces[-1], atol=0.05)
 
 
 def test_in_safe_mode_no_shape_of_the_mirror_is_adopted() -> None:
@@ -403,7 +404,7 @@ def test_an_offset_moves_the_wavefront_but_not_the_pseudo_open_loop_modes(signal
         assert loop.ask("offset", values=values).accepted
         loop.run(SETTLING_FRAMES + FADING_FRAMES + 50)
         assert np.allclose(loop.wavefronts[-1], expected, atol=0.1)
-        assert np.allclose(loop.outputs[-1].step.pol_nm, DISTURBED, atol=0.1)
+        assert np.allclose(loop.outputs[-1].step.pol_nm, DISTURBANCE_NM, atol=0.1)
 
 
 def test_a_law_for_another_loop_is_refused() -> None:

@@ -1,4 +1,4 @@
-"""The fused step against the numpy step: random frames and states; both steps start from the same state."""
+"""The fused step compared with the numpy step on random frames; both steps start from the same random state."""
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
@@ -27,12 +27,14 @@ from lowfc.programs.core.start_up import settings_at_start
 from tests.support import toy
 
 RATE_HZ = 1000.0
-SAME_NM = 2e-4  # allowed difference: the order of sums depends on the processor; 1.5e-4 nm with AVX-512 in 10^6 frames
-LIMITED_NM = 5e-4  # the same if the neighbour limit acts, which divides by small differences; 2.4e-4 nm on an AMD EPYC
+SAME_NM = 2e-4
+"""Allowed difference. The order of sums depends on the processor: up to 1.5e-4 nm in 10^6 frames with AVX-512."""
+LIMITED_NM = 5e-4
+"""Allowed difference if the neighbour limit acts, which divides by small differences: up to 2.4e-4 nm on AMD EPYC."""
 ROUNDINGS = 10
-"""Allowed difference, in float32 roundings of a step's largest number: up to 500 nm if no pixel counts as saturated."""
+"""Allowed difference in float32 roundings of a step's largest number, which reaches 500 nm if pixels never saturate."""
 COMMAND_ARRAYS = 2
-"""Number of arrays of a step that are commands."""
+"""Number of the first arrays of `_numbers` that are commands."""
 BAD_IMAGES = ("dark", "faint", "saturated pixel", "saturated pixels", "frozen", "aberrated")
 pytestmark = pytest.mark.skipif(not compiled.available(), reason="needs the extra `fast`")
 
@@ -112,7 +114,7 @@ class Bench:
         ][rng.integers(9)]
 
     def pixels(self) -> Pixels:
-        """An image; 4 % of the images are bad in one of the ways of `BAD_IMAGES`."""
+        """An image; 4 % of the new images are bad in one of the ways of `BAD_IMAGES`; "frozen" repeats the last one."""
         rng = self.rng
         kind = str(rng.choice(BAD_IMAGES)) if rng.random() < 0.04 else "usual"
         self.repeats = max(self.repeats - 1, 4 * (kind == "frozen"))
@@ -139,7 +141,7 @@ class Bench:
             self.frame(Frame(toy.frame_sequence(self.count), self.count * 1_000_000, age_ns, self.pixels()))
 
     def frame(self, frame: Frame) -> None:
-        """Process a frame with both implementations, and compare."""
+        """Process a frame with both implementations, and compare the results."""
         loop, reference_state = self.state.loop, self.reference_state
         same_state = self.state._replace(
             loop=loop._replace(estimator=loop.estimator._replace(tables=None)),

@@ -40,7 +40,7 @@ def applied(setup: Settings, state: State, name: str, **fields: object) -> tuple
 
 
 @pytest.mark.parametrize(
-    ("test", "value", "input_", "why"),
+    ("test", "value", "received", "why"),
     [
         ("equal", True, True, "mask is true"),
         ("equal", True, False, ""),
@@ -55,19 +55,19 @@ def applied(setup: Settings, state: State, name: str, **fields: object) -> tuple
         ("equal", 1.0, None, "no value of mask has been received"),
     ],
 )
-def test_an_interlock_acts_on_its_condition_and_if_configured_on_a_missing_or_old_value(
-    test: str, value: Value, input_: Value | None, why: str
+def test_an_interlock_acts_on_its_condition_and_if_configured_on_a_missing_unsuitable_or_old_value(
+    test: str, value: Value, received: Value | None, why: str
 ) -> None:
     interlock = Interlock("mask", test, value, Action.HOLD, 2 * SECOND_NS)
     not_when_old = interlock._replace(acts_when_old=False)
-    assert interlock.cause(input_, 2 * SECOND_NS) == why
-    assert not_when_old.cause(input_, 2 * SECOND_NS) == (why if type(input_) is type(value) else "")
-    assert interlock.cause(input_, 2 * SECOND_NS + 1)
-    assert not not_when_old.cause(input_, 2 * SECOND_NS + 1)
+    assert interlock.cause(received, 2 * SECOND_NS) == why
+    assert not_when_old.cause(received, 2 * SECOND_NS) == (why if type(received) is type(value) else "")
+    assert interlock.cause(received, 2 * SECOND_NS + 1)
+    assert not not_when_old.cause(received, 2 * SECOND_NS + 1)
 
 
 def test_an_interlock_holds_and_releases_the_command_at_the_next_frame() -> None:
-    """It acts at random times. A replay of all inputs, with bench reports encoded as in a log, gives the same steps."""
+    """It acts at random times. A replay of the inputs, with bench reports encoded as in a log, gives the same steps."""
     setup, rng = settings_under(Action.HOLD), np.random.default_rng(5)
     state = replayed_state = running(setup)
     count, acting, flips, logged = 5, False, 0, []
@@ -221,7 +221,9 @@ def test_a_permit_is_granted_while_the_loop_is_not_closed() -> None:
             check_reply(outputs, True, f"the loop is {state.mode.in_words}")
         _, outputs = applied(setup, after, "close" if name == "open" else "clear")
         check_reply(outputs, False, "reserved for moving the mask")
-    check_reply(outputs, False, "`lowfc ctl stop` ends that")  # in every mode; `open` is refused in safe mode
+    check_reply(
+        outputs, False, "`lowfc ctl stop` ends that"
+    )  # `stop` ends it in every mode, while `open` is refused in safe mode
     state, _ = applied(setup, after, "stop")
     check_reply(applied(setup, state, "clear")[1], True)
 

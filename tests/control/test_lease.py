@@ -18,7 +18,7 @@ from tests.support.toy import GRID, NOLL, WAVE_NM, check_reply, feed, frame, fra
 
 DEFAULTS = settings(rate_hz=1000.0)
 HOLDER = "lowfc calibrate (anna, pid 7)"
-MINE = 11
+LEASE_ID = 11
 """Identity of the holder's lease."""
 SECOND_NS = 1_000_000_000
 
@@ -26,7 +26,7 @@ SECOND_NS = 1_000_000_000
 def reserved_loop(seconds: float = 10.0, frames: int = 3) -> State:
     """A closed loop that is reserved from time 0."""
     state, _ = feed(DEFAULTS, loaded(DEFAULTS), *(frame(count, WAVE_NM) for count in range(1, frames + 1)))
-    state, outputs = applied(state, Request(0, "lease", values=(seconds,), text=HOLDER, lease_id=MINE))
+    state, outputs = applied(state, Request(0, "lease", values=(seconds,), text=HOLDER, lease_id=LEASE_ID))
     check_reply(outputs, True)
     assert names([outputs]) == ["LEASE_TAKEN"]
     return state
@@ -40,21 +40,23 @@ def played(state: State, frames: int = 500) -> State:
     """The state with a probe sequence in progress."""
     shape = np.full(GRID, 3, np.float32).reshape(-1)
     table = np.ones((frames, 1), np.float32)
-    request = Request(0, "play", text=MIRROR, actuators_nm=shape, table=table, lease_id=MINE)
+    request = Request(0, "play", text=MIRROR, actuators_nm=shape, table=table, lease_id=LEASE_ID)
     state, outputs = applied(state, request)
     check_reply(outputs, True)
     return state
 
 
 def remaining_rows(state: State) -> int:
+    """Number of rows of the probe sequence that are still to be played."""
     channels = state.loop.command_channels
     return 0 if channels is None or channels.play is None else channels.play.remaining(state.frame_sequence + 1)
 
 
-GRANTED = {"safe", "open", "pause", "stop", "status", "note", "lease", "renew", "release", "permit", "configuration"}
+EXEMPT = {"safe", "open", "pause", "stop", "status", "note", "lease", "renew", "release", "permit", "configuration"}
+"""Requests that a lease does not reserve for its holder; a second `lease` or `permit` is refused by its own rule."""
 
 
-@pytest.mark.parametrize("name", sorted({*REQUESTS} - GRANTED))
+@pytest.mark.parametrize("name", sorted({*REQUESTS} - EXEMPT))
 def test_requests_of_other_clients_are_refused_with_the_holders_name(name: str) -> None:
     state = reserved_loop()
     after, outputs = applied(state, Request(4 * SECOND_NS, name))
@@ -63,11 +65,11 @@ def test_requests_of_other_clients_are_refused_with_the_holders_name(name: str) 
 
 
 def test_the_holders_requests_are_granted() -> None:
-    state, outputs = applied(reserved_loop(), Request(SECOND_NS, "gain", values=(0.3,), lease_id=MINE))
+    state, outputs = applied(reserved_loop(), Request(SECOND_NS, "gain", values=(0.3,), lease_id=LEASE_ID))
     check_reply(outputs, True)
-    state, outputs = applied(state, Request(SECOND_NS, "open", lease_id=MINE))
+    state, outputs = applied(state, Request(SECOND_NS, "open", lease_id=LEASE_ID))
     assert state.mode is LoopMode.OPEN
-    state, outputs = applied(state, Request(2 * SECOND_NS, "renew", values=(10.0,), text=HOLDER, lease_id=MINE))
+    state, outputs = applied(state, Request(2 * SECOND_NS, "renew", values=(10.0,), text=HOLDER, lease_id=LEASE_ID))
     check_reply(outputs, True)
 
 
@@ -77,12 +79,12 @@ def test_safe_open_pause_and_stop_of_another_client_end_a_lease_and_its_probe_se
     check_reply(outputs, True)
     assert "LEASE_ENDED" in names([outputs])
     assert not remaining_rows(state)
-    state, outputs = applied(state, Request(2 * SECOND_NS, "renew", values=(10.0,), text=HOLDER, lease_id=MINE))
+    state, outputs = applied(state, Request(2 * SECOND_NS, "renew", values=(10.0,), text=HOLDER, lease_id=LEASE_ID))
     assert outputs.reply.text == f"the lease ended: operator asked to {name}"
 
 
 def test_the_end_of_a_lease_names_its_holder_without_the_remaining_time() -> None:
-    request = Request(0, "lease", values=(10.0,), text=f"{HOLDER}, about 33 s to go", lease_id=MINE)
+    request = Request(0, "lease", values=(10.0,), text=f"{HOLDER}, about 33 s to go", lease_id=LEASE_ID)
     state, _ = applied(loaded(DEFAULTS), request)
     _, outputs = applied(state, Request(SECOND_NS, "stop"))
     assert [event.details["holder"] for event in outputs.events if event.name == "LEASE_ENDED"] == [HOLDER]
@@ -100,12 +102,12 @@ def test_close_reports_whether_the_loop_was_closed_already() -> None:
 @pytest.mark.parametrize("ended", [True, False])
 def test_requests_of_a_former_holder_are_refused_with_the_reason(name: str, ended: bool) -> None:
     state = applied(reserved_loop(), Request(SECOND_NS, "pause"))[0] if ended else loaded(DEFAULTS)
-    _, outputs = applied(state, Request(2 * SECOND_NS, name, values=(0.1,), lease_id=MINE))
+    _, outputs = applied(state, Request(2 * SECOND_NS, name, values=(0.1,), lease_id=LEASE_ID))
     check_reply(outputs, False, ("operator asked to pause" if ended else "did the controller restart"))
 
 
 def test_safe_mode_ends_and_refuses_a_lease() -> None:
-    state, outputs = applied(reserved_loop(), Request(SECOND_NS, "safe", lease_id=MINE))
+    state, outputs = applied(reserved_loop(), Request(SECOND_NS, "safe", lease_id=LEASE_ID))
     assert outputs.reply.text == f"loop in safe mode; this ended the reservation for {HOLDER}"
     _, outputs = applied(state, Request(SECOND_NS, "lease", values=(5.0,), text=HOLDER, lease_id=12))
     assert "safe mode" in outputs.reply.text
@@ -126,7 +128,7 @@ def test_a_lease_has_one_holder_and_only_the_holder_can_release_it() -> None:
     check_reply(outputs, False)
     after, outputs = applied(after, Request(SECOND_NS, "release", lease_id=12))
     assert after.conditions == state.conditions
-    after, outputs = applied(after, Request(SECOND_NS, "release", lease_id=MINE))
+    after, outputs = applied(after, Request(SECOND_NS, "release", lease_id=LEASE_ID))
     assert names([outputs]) == ["LEASE_RELEASED"]
     after, outputs = applied(after, Request(SECOND_NS, "gain", values=(0.2,)))
     check_reply(outputs, True)
@@ -146,7 +148,7 @@ def test_a_lease_has_one_holder_and_only_the_holder_can_release_it() -> None:
     ],
 )
 def test_an_invalid_lease_is_refused(fields: dict[str, object], why: str) -> None:
-    request = Request(0, "lease", values=(5.0,), text=HOLDER, lease_id=MINE)
+    request = Request(0, "lease", values=(5.0,), text=HOLDER, lease_id=LEASE_ID)
     _, outputs = applied(loaded(DEFAULTS), replace(request, **fields))
     check_reply(outputs, False, why)
 
@@ -167,7 +169,7 @@ def test_a_lease_ends_after_the_frames_of_its_duration() -> None:
 def test_a_lease_lasts_its_seconds_at_any_frame_rate(period_ns: int, ahead_ns: int) -> None:
     """The configured rate is 1 kHz; the camera's clock may differ from the controller's."""
     first, _ = feed(DEFAULTS, loaded(DEFAULTS), frame(1, WAVE_NM, time_ns=ahead_ns + period_ns))
-    state, _ = applied(first, Request(0, "lease", values=(1.0,), text=HOLDER, lease_id=MINE))
+    state, _ = applied(first, Request(0, "lease", values=(1.0,), text=HOLDER, lease_id=LEASE_ID))
     count = 1
     while not state.conditions.lease.ended:
         count += 1
@@ -232,9 +234,9 @@ def test_an_unwise_value_is_granted_with_a_remark(name: str, value: float, remar
 
 def test_the_remark_on_limits_names_the_mode_that_the_stroke_limits_first() -> None:
     state = loaded(DEFAULTS)
-    twice = state.loop.to_actuators * np.float32([1, 2, 1])
-    reach_nm = DEFAULTS.limits.stroke_nm / np.abs(twice[:, 1]).max()
-    _, reply = answer(state._replace(loop=state.loop._replace(to_actuators=twice)), "limit", 1e9)
+    to_actuators = state.loop.to_actuators * np.float32([1, 2, 1])
+    reach_nm = DEFAULTS.limits.stroke_nm / np.abs(to_actuators[:, 1]).max()
+    _, reply = answer(state._replace(loop=state.loop._replace(to_actuators=to_actuators)), "limit", 1e9)
     assert reply.text.endswith(f": above {reach_nm:.3g} nm the stroke of 700 nm limits mode 3 first")
 
 
@@ -269,8 +271,8 @@ def test_the_reply_to_the_removal_of_a_channel_names_it_or_the_existing_channels
 def test_the_refusal_of_an_offset_names_its_mode() -> None:
     _, reply = answer(loaded(DEFAULTS), "offset", 80.0, modes=(4,))
     assert (reply.accepted, reply.text) == (False, "offset of mode 4: at most its limit, 50 nm; asked for 80 nm")
-    whole = loaded(DEFAULTS).loop.calibration
-    truncated = replace(whole, actuators_to_modes=np.zeros_like(whole.modes_to_actuators.T))
+    complete = loaded(DEFAULTS).loop.calibration
+    truncated = replace(complete, actuators_to_modes=np.zeros_like(complete.modes_to_actuators.T))
     load, offset = Request(1, "load", calibration=truncated), Request(1, "offset", (4,), (5.0,))
     for order in ((load, offset), (offset, load)):  # the later one is refused
         *_, outputs = feed(DEFAULTS, loaded(DEFAULTS), Request(0, "open"), *order)[1]

@@ -67,10 +67,10 @@ def test_the_limits_hold_for_any_requested_shape(previous: Single, requested: Si
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(stroke=st.floats(5, 2e5), slew=st.floats(0.05, 1), neighbour=st.floats(0.05, 1), seed=st.integers(0, 2**32 - 1))
 @example(stroke=2e5, slew=0.05, neighbour=0.05, seed=1)
-def test_steps_are_within_the_limits_for_any_values_of_the_limits(
+def test_commands_are_within_the_limits_for_any_values_of_the_limits(
     stroke: float, slew: float, neighbour: float, seed: int
 ) -> None:
-    """This holds over many steps, also for strokes at which float32 rounding exceeds the default margin."""
+    """This holds for 20 successive commands, also for strokes at which float32 rounding exceeds the default margin."""
     limits = Limits(stroke, slew * stroke, neighbour * stroke)
     rng = np.random.default_rng(seed)
     shape = np.zeros(GRID, np.float32)
@@ -172,7 +172,7 @@ def test_repeated_requests_for_flat_reach_flat_within_the_slew_limit(previous: S
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(shape=allowed_shapes, seed=st.integers(0, 2**32 - 1))
 def test_a_mirror_pressed_against_the_neighbour_limit_stays_there(shape: Single, seed: int) -> None:
-    """Repeated requests beyond the limit neither move it back towards flat nor make it oscillate."""
+    """Repeated requests beyond the limit neither move the mirror back towards flat nor make it oscillate."""
     rng = np.random.default_rng(seed)
     requested = (5000 * rng.standard_normal(GRID)).astype(np.float32)
     for _ in range(30):
@@ -195,10 +195,10 @@ def test_request_mode_refuses_an_unknown_request() -> None:
 def test_the_document_on_safety_names_code_that_exists() -> None:
     text = (Path(__file__).parents[2] / "docs" / "explanation" / "safety.md").read_text(encoding="utf-8")
     rows = [line.split("|") for line in text.splitlines() if line.startswith("| ")]
-    places = {place for row in rows for place in re.findall(r"`([\w.]+)`", row[3])}
-    assert len(places) > 30
-    for place in places:
-        pkgutil.resolve_name(f"lowfc.{place}")
+    names = {name for row in rows for name in re.findall(r"`([\w.]+)`", row[3])}
+    assert len(names) > 30
+    for name in names:
+        pkgutil.resolve_name(f"lowfc.{name}")
 
 
 SOURCE = Path(safety.__file__).read_text(encoding="utf-8")
@@ -264,7 +264,7 @@ def module_of(source: str) -> ModuleType:
 
 
 def check(module: Any) -> None:
-    """Raise AssertionError, or an error of the mutation, if the module does not work."""
+    """Raise AssertionError, or an error that the mutation causes, if the module does not work."""
     for case in CASES:
         check_case(module.limit, case)
     _check_random_walks(module)
@@ -301,17 +301,17 @@ def _check_random_walks(module: Any) -> None:
 
 def check_modes(module: Any) -> None:
     mode, ask = module.LoopMode, module.request_mode
-    for now in mode:
+    for before in mode:
         for calibrated in (True, False):
-            assert ask(now, "safe", calibrated) == (mode.SAFE, "")
-            safe, opened = now is mode.SAFE, mode.OPEN if calibrated else mode.IDLE
-            after, refusal = ask(now, "clear", calibrated)
-            assert (after, "nothing to clear" in refusal) == ((opened, False) if safe else (now, True))
-            after, refusal = ask(now, "open", calibrated)
-            assert (after, "clear" in refusal) == ((now, True) if safe else (opened, False))
-            after, refusal = ask(now, "close", calibrated)
+            assert ask(before, "safe", calibrated) == (mode.SAFE, "")
+            safe, opened = before is mode.SAFE, mode.OPEN if calibrated else mode.IDLE
+            after, refusal = ask(before, "clear", calibrated)
+            assert (after, "nothing to clear" in refusal) == ((opened, False) if safe else (before, True))
+            after, refusal = ask(before, "open", calibrated)
+            assert (after, "clear" in refusal) == ((before, True) if safe else (opened, False))
+            after, refusal = ask(before, "close", calibrated)
             if safe or not calibrated:
-                assert (after, ("clear" if safe else "calibration") in refusal) == (now, True)
+                assert (after, ("clear" if safe else "calibration") in refusal) == (before, True)
             else:
                 assert (after, refusal) == (mode.CLOSED, "")
 

@@ -69,7 +69,7 @@ def test_r_of_pinv_is_numpys_pseudo_inverse_of_h_and_r_of_weighted_is_not() -> N
 
 
 def cramer_rao(flux_e: float, read_noise_e: float) -> np.ndarray:
-    """Bound (modes, modes), nm^2, of modes fitted together with the flux, for Gaussian noise of known variance."""
+    """Cramer-Rao bound (modes, modes), nm^2, of modes fitted with the flux, for Gaussian noise of known variance."""
     image_e = flux_e * TOY.reference / TOY.reference.sum()
     design = np.column_stack([flux_e * RESPONSE / TOY.reference.sum(), image_e])
     information = design.T @ (design / (image_e + read_noise_e**2)[:, None])
@@ -94,7 +94,7 @@ def test_the_predicted_noise_agrees_with_a_monte_carlo_simulation(estimator: str
     frames = rng.poisson(flux_e * I0, (trials, PIXELS)) + read_noise_e * rng.standard_normal((trials, PIXELS))
     errors = (frames / (frames @ SOME_BAD)[:, None] - I0) @ R.T
     predicted = noise_nm(R, I0, flux_e, read_noise_e)
-    # The standard deviation of a standard deviation is 1 / sqrt(2 trials): four of them are 4.5 %.
+    # The relative error of a standard deviation from these trials is 1 / sqrt(2 trials); four times that is 4.5 %.
     assert np.abs(errors.std(axis=0) / predicted - 1).max() < 4 / np.sqrt(2 * trials)
 
 
@@ -115,7 +115,7 @@ def test_a_sensor_that_cannot_tell_modes_apart_is_refused(response: np.ndarray, 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("unit", [1.0, 1e-9, 1e12])
-def test_a_fitted_nuisance_parameter_is_not_measured_as_modes_whatever_its_unit(estimator: str, unit: float) -> None:
+def test_fitted_nuisance_parameters_are_not_measured_as_modes_whatever_their_unit(estimator: str, unit: float) -> None:
     ramp = np.linspace(-1, 1, PIXELS)
     background = np.column_stack([np.ones(PIXELS), TOY.reference * ramp])
     nuisance_response = normalise_flux(TOY.reference, background, GOOD)[1]
@@ -123,10 +123,10 @@ def test_a_fitted_nuisance_parameter_is_not_measured_as_modes_whatever_its_unit(
     assert R.shape == (3, PIXELS)
     assert np.abs(R @ H - np.eye(3)).max() < 1e-9
     assert np.abs(R @ nuisance_response).max() < 1e-9 * np.abs(R).max()
-    plain = reconstructor(I0, H, GOOD, 1e5, 2.0, estimator)
-    assert np.abs(plain @ nuisance_response).max() > 1e-3 * np.abs(plain).max()
-    if estimator == "weighted":  # fitting the nuisance parameter costs some noise
-        assert (noise_nm(R, I0, 1e5, 2.0) > noise_nm(plain, I0, 1e5, 2.0)).all()
+    without_fit = reconstructor(I0, H, GOOD, 1e5, 2.0, estimator)
+    assert np.abs(without_fit @ nuisance_response).max() > 1e-3 * np.abs(without_fit).max()
+    if estimator == "weighted":  # fitting the nuisance parameters increases the noise
+        assert (noise_nm(R, I0, 1e5, 2.0) > noise_nm(without_fit, I0, 1e5, 2.0)).all()
 
 
 @pytest.mark.parametrize("nuisance", [RESPONSE[:, :1], np.zeros((PIXELS, 1))])
@@ -148,8 +148,8 @@ def test_the_condition_number_of_a_response_in_which_a_mode_has_no_signal_is_inf
 
 def test_an_estimate_is_r_times_the_difference_from_i0_after_division_by_the_flux() -> None:
     rng = np.random.default_rng(3)
-    shifted = rng.uniform(0.5, 1.5, PIXELS) * calibration().reference  # so that R I0 is not zero
-    calibration_ = replace(calibration(), reference=(shifted / shifted.sum()).astype(np.float32))
+    uneven = rng.uniform(0.5, 1.5, PIXELS) * calibration().reference  # so that R I0 is not zero
+    calibration_ = replace(calibration(), reference=(uneven / uneven.sum()).astype(np.float32))
     out = np.empty(PIXELS, np.float32)
     for flux_dn in (30_000.0, 300_000.0):
         pixels = rng.poisson(TOY.pixels((3, -4, 5), flux_dn).reshape(-1)).astype(np.uint16)
@@ -198,7 +198,7 @@ def test_an_inconsistent_calibration_is_refused(change: dict[str, object], messa
 
 
 def computed_image() -> np.ndarray:
-    """An image unchanged by a rotation of 180 degrees, like that of a flat wavefront, but not by a reflection."""
+    """An image like that of a flat wavefront: a rotation by 180 degrees does not change it, but a reflection does."""
     rng = np.random.default_rng(4)
     y, x = np.indices((64, 64)) - 31.5
     speckles = gaussian_filter(rng.standard_normal((64, 64)), 2.5)
@@ -224,12 +224,12 @@ def test_align_recovers_the_geometry_of_a_noisy_image(geometry: Geometry) -> Non
 def test_a_rotation_by_180_degrees_keeps_the_image_and_inverts_the_response() -> None:
     geometry = Geometry(1.1, 30.0, 40.0, 20.0, -1)
     image = computed_image()
-    other = geometry.rotated(180)
-    assert other.rotated(180) == geometry
-    assert np.allclose(onto(image, geometry, (70, 80)), onto(image, other, (70, 80)), atol=1e-9)
+    rotated = geometry.rotated(180)
+    assert rotated.rotated(180) == geometry
+    assert np.allclose(onto(image, geometry, (70, 80)), onto(image, rotated, (70, 80)), atol=1e-9)
     slope = image - np.roll(image, 1, axis=0)
     slope = slope - slope[::-1, ::-1]
-    assert np.allclose(onto(slope, geometry, (70, 80)), -onto(slope, other, (70, 80)), atol=1e-9)
+    assert np.allclose(onto(slope, geometry, (70, 80)), -onto(slope, rotated, (70, 80)), atol=1e-9)
 
 
 def test_resampling_conserves_flux_for_one_or_many_images() -> None:

@@ -52,12 +52,12 @@ def drift(frames: int, step_nm: float, noise_nm: float, seed: int) -> Array:
 
 
 def test_white_noise_gets_no_gain() -> None:
-    """The noise of 40 first windows has long tails, as from few photons, so that two standard errors are too few."""
-    rng, granted = np.random.default_rng(1), 0
+    """The noise of 40 first windows has long tails, as from few photons, and often exceeds two standard errors."""
+    rng, nonzero_gains = np.random.default_rng(1), 0
     for _ in range(40):
         noise = rng.normal(0, 10, (300, MODES)) * (1 + 4 * (rng.random((300, 1)) < 0.02))
-        granted += np.count_nonzero(verdicts(bank(windows=(300, 1000)), noise, ZEROS, 100.0)[0].gain)
-    assert granted <= 1
+        nonzero_gains += np.count_nonzero(verdicts(bank(windows=(300, 1000)), noise, ZEROS, 100.0)[0].gain)
+    assert nonzero_gains <= 1
 
 
 @pytest.mark.parametrize("leak", [0.0, 0.3])
@@ -66,7 +66,7 @@ def test_the_highest_gain_of_a_bank_is_the_highest_within_the_margins_at_its_lea
 
 
 def test_the_leak_of_one_mode_limits_its_own_gain_only() -> None:
-    """All modes have the same large drift, so that each gets the highest gain with which it is stable."""
+    """All modes have the same large drift, so that each gets the highest gain within the margins at its leak."""
     leak = np.where(np.arange(MODES) == 4, single(0.9), single(0))
     bank_ = GainBank(leak, 1e6 * ONES, ((0, single(1)),), 1.0, (500, 500))
     gain = verdicts(bank_, drift(4000, 50.0, 1.0, 7), ZEROS, 1.0)[-1].gain
@@ -79,7 +79,7 @@ def test_the_leak_of_one_mode_limits_its_own_gain_only() -> None:
 def test_a_drift_gets_nearly_the_gain_with_the_least_residual(step_nm: float, delay_frames: float) -> None:
     """For a delay of one frame, the residual rms is within 12 % of the least.
 
-    Its square is s^2 / (g (2 - g)) from drift steps of s nm rms, plus n^2 g / (2 - g) from noise of n nm rms.
+    For a gain g, its square is s^2 / (g (2 - g)) from drift steps of s nm rms, plus n^2 g / (2 - g) from n nm of noise.
     """
     bank_ = bank(delay_frames, (1000, 2500))
     all_verdicts = verdicts(bank_, drift(8500, step_nm, 10.0, 2), ZEROS, 100.0)
@@ -95,18 +95,18 @@ def test_a_drift_gets_nearly_the_gain_with_the_least_residual(step_nm: float, de
 
 
 def test_modes_with_the_same_disturbance_get_similar_gains() -> None:
-    """Gains of 30 modes with the same drift differ less than if each were judged alone, and none stays at 0."""
+    """Gains of 30 modes with the same drift differ less than if they were judged in pairs, and none stays at 0."""
     wander = drift(1000, 0.2, 10.0, 11)
     together = verdicts(bank(), wander, ZEROS, 100.0)[0].gain
-    alone = np.concatenate(
+    in_pairs = np.concatenate(
         [
             verdicts(bank(modes=2), wander[:, [mode, mode + 1]], np.zeros(2, np.float32), 100.0)[0].gain
             for mode in range(0, MODES, 2)
         ]
     )
-    assert not alone.all()
+    assert not in_pairs.all()
     assert together.all()
-    assert np.ptp(np.log2(together)) < np.ptp(np.log2(alone[alone > 0]))
+    assert np.ptp(np.log2(together)) < np.ptp(np.log2(in_pairs[in_pairs > 0]))
 
 
 def test_a_gain_changes_by_at_most_a_factor_of_two_unless_open_loop_is_better() -> None:
@@ -136,7 +136,7 @@ def test_the_window_grows_after_a_verdict_that_changes_no_gain() -> None:
     assert max(lengths) >= 200
 
 
-def test_a_new_drift_gets_a_gain_before_the_window_ends() -> None:
+def test_a_mode_that_begins_to_drift_gets_a_gain_before_the_window_ends() -> None:
     bank_, early = bank(windows=(500, 5000)), ZEROS
     verdicts(bank_, drift(500, 0.0, 1.0, 8), ZEROS, 1.0)
     for count, modes_nm in enumerate(drift(3000, 0.5, 1.0, 9).astype(np.float32)):
@@ -148,7 +148,7 @@ def test_a_new_drift_gets_a_gain_before_the_window_ends() -> None:
 
 
 def vibrating_tilt(frames: int, seed: int) -> tuple[Array, Array]:
-    """Tip and tilt of 20 nm rms, (frames, 2), and 30 modes with 1 nm of noise, one with cross-talk of their squares."""
+    """Tilts (frames, 2) of 20 nm rms, and modes (frames, 30) with 1 nm of noise; mode 4 has cross-talk from tilt^2."""
     rng = np.random.default_rng(seed)
     time = np.arange(frames)[:, None]
     tilt_nm = 28 * np.sin(time * np.array([0.7, 0.41]) + np.array([0.2, 1.1])) + rng.normal(0, 1, (frames, 2))
@@ -166,7 +166,7 @@ def test_a_mode_with_only_tilt_cross_talk_gets_no_gain(closed: bool) -> None:
 
 
 def test_the_reported_change_excludes_the_cross_talk_margin() -> None:
-    """The mode has a true 20 nm and 2.7 nm of cross-talk: a loop would leave a true residual of 2.7 nm."""
+    """Mode 4 has an aberration of 20 nm and 2.7 nm of cross-talk: a loop would leave a true residual of 2.7 nm."""
     tilt_nm, modes_nm = vibrating_tilt(1000, 19)
     modes_nm[:, 4] += 20
     [verdict] = verdicts(bank(), modes_nm, np.full(MODES, 0.1, np.float32), 1.0, tilt_nm)
@@ -202,7 +202,7 @@ def test_tilt_cross_talk_does_not_favour_a_gain() -> None:
 
 
 def test_tilt_cross_talk_follows_a_change_of_the_reconstructor() -> None:
-    """With another R, mode 7 contains minus twice mode 4, and so the cross-talk of tilt, which it lacked before."""
+    """Another R adds minus twice mode 4 to mode 7, and with it the cross-talk of tilt, which mode 7 lacked before."""
     tilt_nm, modes_nm = vibrating_tilt(5200, 22)
     mixing = np.eye(MODES)
     mixing[7, 4] = -2
@@ -269,13 +269,13 @@ def test_rows_of_corrected_modes_are_the_map_estimate() -> None:
     assert np.einsum("p,p,p", rows[0], 1 / W, rows[0]) < 0.7 * before[0]  # the mode that resembles an uncorrected one
 
 
-def test_r_stays_if_all_modes_or_no_modes_are_corrected_or_the_camera_is_unknown() -> None:
+def test_r_is_unchanged_if_all_modes_or_no_modes_are_corrected_or_the_camera_is_unknown() -> None:
     calibration, camera = _calibration()
     for prior, settings in ((np.zeros(5), camera), (np.ones(5), camera), (np.array([1.0, 0, 0, 0, 0]), None)):
         assert map_rows(calibration, prior, 5e4, settings, calibration.reconstructor)[0] is calibration.reconstructor
 
 
-def test_the_prior_of_uncorrected_modes_is_their_power_minus_noise_plus_two_standard_errors() -> None:
+def test_the_prior_of_uncorrected_modes_is_their_power_less_noise_plus_two_standard_errors_of_the_noise() -> None:
     power, zero_gain = np.array([2.0, 1.0, 5.0]), np.zeros(3)
     prior_nm2 = uncorrected_prior_nm2(
         Verdict(zero_gain, power, np.ones(3), zero_gain, zero_gain, None, zero_gain, 5000),

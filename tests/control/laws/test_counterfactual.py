@@ -1,4 +1,4 @@
-"""Loops recomputed by `lowfc what-if`, against the live loop's `advance` and against hand calculations."""
+"""Loops recomputed by `lowfc what-if`, compared with the live loop's `advance` and with hand calculations."""
 
 import numpy as np
 import pytest
@@ -36,18 +36,18 @@ def weights(delay_frames: float) -> np.ndarray:
 
 
 def live_run(setup: Settings) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Errors, pseudo-open-loop modes and commands (steps, modes) of the live loop on a walk, and missing exposures."""
+    """Errors, pseudo-open-loop modes and commands (steps, modes), nm, of the live loop; frames missing before each."""
     steps, _, _ = run_toy(setup, WALK, missing=MISSING, dark=DARK)
-    no_modes = np.full(3, np.nan, np.float32)
-    error = np.array([no_modes if step.error_nm is None else step.error_nm for step in steps])
-    pol = np.array([no_modes if step.pol_nm is None else step.pol_nm for step in steps])
+    not_measured = np.full(3, np.nan, np.float32)
+    error = np.array([not_measured if step.error_nm is None else step.error_nm for step in steps])
+    pol = np.array([not_measured if step.pol_nm is None else step.pol_nm for step in steps])
     sequence = np.array([step.frame_sequence for step in steps], np.uint64)
     return error, pol, np.array([step.command_nm for step in steps]), missing_before(sequence)
 
 
 @pytest.mark.parametrize("delay", DELAYS)
 def test_the_logged_gains_reproduce_the_logged_errors_and_commands(delay: float) -> None:
-    """Both agree up to float32 rounding in pol = error - seen; frames are missing or refused, a modal limit acts."""
+    """They agree up to float32 rounding in pol = error - seen, with missing and refused frames and a modal limit."""
     setup = settings(delay_frames=delay, gain=(0.3, 0.2), leak=(0.01, 0.0), limit_nm=(12.0, 50.0))
     error, pol, command, missing = live_run(setup)
     assert missing.sum() == 9
@@ -83,7 +83,7 @@ def test_an_integrators_errors_after_a_step_agree_with_a_hand_calculation(delay:
     assert command[:, 0].tolist() == np.cumsum([-0.5 * value for value in errors]).tolist()
 
 
-def test_any_function_of_state_and_error_is_a_controller() -> None:
+def test_any_function_of_state_and_error_can_be_the_controller() -> None:
     def every_other(state: int | None, error_nm: np.ndarray, pol_nm: np.ndarray) -> tuple[int, np.ndarray]:
         count = state or 0
         return count + 1, -error_nm if count % 2 else np.zeros_like(error_nm)
@@ -92,7 +92,7 @@ def test_any_function_of_state_and_error_is_a_controller() -> None:
     assert command[:, 0].tolist() == [0, -8, -8, 0, -8]
 
 
-def test_an_exposure_sees_the_commands_of_its_delay_also_after_missing_frames() -> None:
+def test_an_exposure_sees_the_delayed_commands_also_after_missing_frames() -> None:
     command, first, missing = one_mode(1, 2, 4, 8), np.array([-1], np.float32), np.array([0, 0, 3, 0])
     assert seen_nm(weights(1.0), command, missing, first)[:, 0].tolist() == [-1, 1, 2, 4]
     assert seen_nm(weights(2.0), command, missing, first)[:, 0].tolist() == [-1, -1, 2, 2]
@@ -134,7 +134,7 @@ def test_the_delay_is_recovered_from_message_times() -> None:
     start_ns = 1000 + 1000 * np.arange(40)
     applied_ns = start_ns + 900
     applied_ns[::4] += 200
-    repeated = slice(0, 40, 3)  # the mirror reports some of them again, much later
+    repeated = slice(0, 40, 3)  # the mirror reports some of the commands again, 3000 ns later
     reported, times = np.append(sequence, sequence[repeated]), np.append(applied_ns, applied_ns[repeated] + 3000)
     assert delay_from_times(sequence, start_ns, reported, times) == pytest.approx(1.25, abs=0.02)
     assert delay_from_times(sequence, start_ns, reported[:5], times[:5]) is None
@@ -155,7 +155,7 @@ def test_settling_takes_five_time_constants_and_at_least_250_frames(gain: object
     assert settling_frames(law.gain, law.leak, 250.0) == frames
 
 
-def test_frames_since_counts_from_the_start_of_the_loop_or_a_later_beginning() -> None:
+def test_frames_since_counts_from_the_first_running_step_or_a_later_beginning() -> None:
     running = np.array([0, 1, 1, 1, 0, 1, 1, 1], bool)
     begins = np.array([0, 0, 0, 0, 0, 0, 1, 0], bool)
     missing = np.array([0, 0, 3, 0, 0, 0, 0, 0])

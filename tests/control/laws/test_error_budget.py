@@ -1,4 +1,4 @@
-"""Terms of the error budget against hand calculations, and their sum against a simulated loop."""
+"""Terms of the error budget compared with hand calculations, and their sum compared with a simulated loop."""
 
 from collections.abc import Callable
 
@@ -18,7 +18,7 @@ from tests.support.theory import one_piece, rejection
 from tools.law_bench import calibrated
 
 RATE_HZ = 1000.0
-BOTH = np.ones(2, bool)
+BOTH_MODES = np.ones(2, bool)
 SAMPLED = Timing.sampled(1.0)
 
 
@@ -32,8 +32,8 @@ def test_the_noise_of_a_loop_with_one_frame_of_delay_has_a_closed_form() -> None
 
 
 @pytest.mark.parametrize(("delay", "gain", "leak"), [(1.5, 0.5, 0.0), (2.3, 0.2, 0.02), (2.0, 0.3, 0.0)])
-def test_the_noise_term_over_all_time_is_the_noise_of_the_commands(delay: float, gain: float, leak: float) -> None:
-    """Over exposures it is the noise that they see; both follow from the loop's response to the noise of one frame."""
+def test_the_noise_term_in_continuous_time_is_the_noise_of_the_commands(delay: float, gain: float, leak: float) -> None:
+    """In exposures, it is the noise of the seen commands. Both follow from the response to the noise of one frame."""
     weights, commands, seen = delay_weights(delay), [0.0] * 5, [0.0]
     for frame in range(2000):
         seen.append(float(weights @ commands[: -1 - len(weights) : -1]))
@@ -63,23 +63,23 @@ def test_photon_and_read_noise_add_in_quadrature() -> None:
     assert multiplied.read_nm == pytest.approx(noise.read_nm)
 
 
-def test_the_lag_term_of_a_sine_is_its_rejected_power() -> None:
+def test_the_lag_term_of_a_sine_is_its_power_times_the_squared_rejection() -> None:
     time_s = np.arange(16_384) / RATE_HZ
     waves = np.stack([6 * np.sin(2 * np.pi * 31 * time_s), 2 * np.sin(2 * np.pi * 7 * time_s)], axis=1)
     law = law_of_two_modes((0.5, 0.1), (0.0, 0.02))
     power = spectrum(one_piece(waves), RATE_HZ)
-    passed = [
+    rejections = [
         rejection(np.array([hz]), RATE_HZ, gain, leak, 1.0)[0]
         for hz, gain, leak in ((31.0, 0.5, 0.0), (7.0, 0.1, 0.02))
     ]
-    expected = np.array([18, 2]) * np.square(passed)
+    expected = np.array([18, 2]) * np.square(rejections)
     assert lag(law, power, np.zeros(2), SAMPLED).variance_nm2 == pytest.approx(expected, rel=0.02)
     omega, continuous = 2 * np.pi * np.array([31.0, 7.0]) / RATE_HZ, Timing.of(1.0, 0.0)
     expected = np.array([18, 2]) * residual_power(law, omega, continuous).diagonal()
     assert lag(law, power, np.zeros(2), continuous).variance_nm2 == pytest.approx(expected, rel=0.02)
-    with_mean, without = (lag(law, power, np.full(2, mean), SAMPLED).variance_nm2 for mean in (30.0, 0.0))
-    # An integrator without leak removes a mean.
-    assert with_mean - without == pytest.approx([0, (30 * 0.02 / 0.12) ** 2], abs=1e-3)
+    with_mean, without_mean = (lag(law, power, np.full(2, mean), SAMPLED).variance_nm2 for mean in (30.0, 0.0))
+    # The integrator without leak removes the mean; the other leaves leak / (leak + gain) of it.
+    assert with_mean - without_mean == pytest.approx([0, (30 * 0.02 / 0.12) ** 2], abs=1e-3)
 
 
 @pytest.mark.parametrize("timing", [SAMPLED, Timing.of(1.0, 0.0)])
@@ -87,8 +87,8 @@ def test_the_lag_term_is_recovered_from_noisy_measurements(timing: Timing) -> No
     time_s = np.arange(20_000) / RATE_HZ
     waves = 6 * np.sin(2 * np.pi * 31 * time_s)[:, None].repeat(2, axis=1)
     noisy = waves + 4 * np.random.default_rng(3).standard_normal(waves.shape)
-    clear, measured = spectrum(one_piece(waves), RATE_HZ), spectrum(one_piece(noisy), RATE_HZ)
-    expected = lag(law_of_two_modes(), clear, np.zeros(2), timing)
+    noiseless, measured = spectrum(one_piece(waves), RATE_HZ), spectrum(one_piece(noisy), RATE_HZ)
+    expected = lag(law_of_two_modes(), noiseless, np.zeros(2), timing)
     term = lag_under_noise(law_of_two_modes(), measured, np.zeros(2), timing)
     assert np.abs(term.variance_nm2 - expected.variance_nm2).max() < 3 * np.max(term.error_nm2)
     assert term.variance_nm2[0] == pytest.approx(expected.variance_nm2[0], rel=0.25)
@@ -108,13 +108,13 @@ def test_the_total_of_an_undetected_term_is_an_upper_limit(
     variance: list[float], error: object, expected: float, detected: bool
 ) -> None:
     term = Term(np.array(variance), np.array(error) if error else 0.0)
-    assert term.total(BOTH) == (pytest.approx(expected), detected)
+    assert term.total(BOTH_MODES) == (pytest.approx(expected), detected)
 
 
 def simulate_loop(
     measure: Callable[[np.ndarray, int], np.ndarray], frames: int = 8000
 ) -> tuple[TimeSeries, TimeSeries, TimeSeries]:
-    """Error, residual and seen command of a loop with `law_of_two_modes()` and a sensor `measure(residual, frame)`."""
+    """Error, residual and seen command, nm, of a loop with `law_of_two_modes()` and the sensor `measure`."""
     time_s = np.arange(frames) / RATE_HZ
     waves = np.stack([9 * np.sin(2 * np.pi * 11 * time_s), 4 * np.sin(2 * np.pi * 3 * time_s)], axis=1)
     command, rows = np.zeros(2), np.empty((3, frames, 2))
@@ -134,7 +134,7 @@ def test_a_linear_sensor_with_noise_has_no_cross_talk_and_no_nonlinearity() -> N
         law_of_two_modes(), *simulate_loop(lambda residual, index: residual + NOISE[index]), np.ones(2)
     )
     for term in (split.crosstalk, split.nonlinearity):
-        rms_nm, detected = term.total(BOTH)
+        rms_nm, detected = term.total(BOTH_MODES)
         assert not detected
         assert rms_nm < 0.25  # the noise itself leaves 0.6 nm
 
@@ -148,9 +148,9 @@ def test_an_offset_and_linear_mixing_are_cross_talk() -> None:
     error, residual, seen = simulate_loop(mixed)
     split = measurement_error(law_of_two_modes(), error, residual, seen, np.full(2, 0.2))
     steady = np.linalg.solve(np.eye(2) + mixture, -offset)  # the loop settles at a measured error of 0
-    assert split.crosstalk.total(BOTH)[0] == pytest.approx(np.linalg.norm(steady), rel=0.03)
-    assert split.crosstalk.total(BOTH)[1]
-    assert not split.nonlinearity.total(BOTH)[1]
+    assert split.crosstalk.total(BOTH_MODES)[0] == pytest.approx(np.linalg.norm(steady), rel=0.03)
+    assert split.crosstalk.total(BOTH_MODES)[1]
+    assert not split.nonlinearity.total(BOTH_MODES)[1]
 
 
 def test_a_quadratic_response_is_nonlinearity() -> None:
@@ -159,22 +159,22 @@ def test_a_quadratic_response_is_nonlinearity() -> None:
 
     error, residual, seen = simulate_loop(quadratic)
     split = measurement_error(law_of_two_modes(), error, residual, seen, np.full(2, 0.2))
-    straight = simulate_loop(lambda residual, index: residual + 0.2 * NOISE[index])[1].joined()
-    added = residual.joined() - straight
+    linear_residual = simulate_loop(lambda residual, index: residual + 0.2 * NOISE[index])[1].joined()
+    added = residual.joined() - linear_residual
     expected = np.sqrt(np.sum(added.var(axis=0)))
-    assert split.nonlinearity.total(BOTH) == (pytest.approx(expected, rel=0.3), True)
+    assert split.nonlinearity.total(BOTH_MODES) == (pytest.approx(expected, rel=0.3), True)
 
 
 def test_too_few_frames_give_no_measurement_error() -> None:
     signals = simulate_loop(lambda residual, index: residual + NOISE[index], 600)
-    few = [one_piece(signal.joined()[:45]) for signal in signals]
-    assert measurement_error(law_of_two_modes(), *few, np.ones(2)) is None
+    first_frames = [one_piece(signal.joined()[:45]) for signal in signals]
+    assert measurement_error(law_of_two_modes(), *first_frames, np.ones(2)) is None
     empty = TimeSeries((), 0)
     assert measurement_error(law_of_two_modes(), empty, empty, empty, np.ones(2)) is None
 
 
 def test_the_terms_add_up_to_the_residual_of_a_simulated_loop() -> None:
-    """The rms agrees within 6 %, that of tip and tilt within 12 %; in 1.5 s noise alone scatters by 3 to 5 %."""
+    """The rms agrees within 6 %, and that of the tilts within 12 %; in 1.5 s the rms of noise scatters by 3 to 5 %."""
     keys = {"control.start_mode": "closed", "camera.rate_hz": RATE_HZ, "disturbance.scale": 2.0}
     config = load(None, keys | FIXED_GAINS | SMALL_MIRROR)
     calibration = calibrated(config)

@@ -1,4 +1,4 @@
-"""LQG for damped lines: its residual compared with that of the best law within the margins, and its margins."""
+"""LQG laws for damped lines: their residual compared with that of the best law within the margins; their margins."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def tilts_of(config: Configuration, noise_nm: Array, frames: int = FRAMES) -> Ti
 
 @pytest.mark.slow
 def test_an_identified_law_is_nearly_optimal() -> None:
-    """At this noise level the best law keeps the margins anyway."""
+    """At this noise level even the best law without a limit on margins keeps them."""
     config = configured()
     calibration = calibrated(config)
     law = tuned(tilts_of(config, frame_noise_nm(config, calibration)[:2], 8000), config)["lqg"].law
@@ -72,19 +72,19 @@ def test_a_filter_keeps_the_margins_at_any_noise(noise_nm: float, width: float, 
     blocks = within_margins(model, timing), lqg_block(model, timing)
     law, unconstrained = (law_from_blocks([block], "pol", "lqg", (2,), delay, RATE_HZ) for block in blocks)
 
-    def ratio(filter_: LinearLaw) -> float:
-        """Smallest ratio of a margin to its limit; for a filter the limit of the phase margin is 0.7 times as large."""
-        kept = margins(filter_, delay)
-        gain = min(kept.gain_margin[0], 1 / max(kept.gain_reduction[0], 1e-9)) / MIN_GAIN_MARGIN
-        return float(min(gain, kept.phase_margin_deg[0] / (0.7 * MIN_PHASE_MARGIN_DEG)))
+    def margin_ratio(filter_: LinearLaw) -> float:
+        """Smallest ratio of a margin to its limit; for filters the limit of the phase margin is 0.7 times as large."""
+        found = margins(filter_, delay)
+        gain = min(found.gain_margin[0], 1 / max(found.gain_reduction[0], 1e-9)) / MIN_GAIN_MARGIN
+        return float(min(gain, found.phase_margin_deg[0] / (0.7 * MIN_PHASE_MARGIN_DEG)))
 
-    assert ratio(law) >= 1
-    assert ratio(law) < 1.1 or ratio(law) == ratio(unconstrained)
+    assert margin_ratio(law) >= 1
+    assert margin_ratio(law) < 1.1 or margin_ratio(law) == margin_ratio(unconstrained)
 
 
 @pytest.mark.slow
 def test_laws_from_modes_agree_with_laws_from_images() -> None:
-    """Images of the twin and modes without images give the same noise level above the lines and nearly the same laws.
+    """Modes from images and modes without images give the same noise level above the lines and nearly the same laws.
 
     The identified noise is lower than a frame's: the model of a line has wings up to half the rate, while those of the
     simulated lines end earlier.

@@ -1,4 +1,4 @@
-"""Spectra of noise, sines and series with gaps; transfer functions measured in loops, against theory."""
+"""Spectra of noise, sines and series with gaps; transfer functions measured in loops, compared with theory."""
 
 from dataclasses import replace
 
@@ -115,7 +115,7 @@ def test_bins_are_even_in_the_logarithm_and_preserve_a_straight_line() -> None:
     assert steps == pytest.approx(0.05, abs=0.015)
 
 
-PERIOD = 3000
+PERIOD = 3000  # frames
 GAIN = (0.4, 0.1)
 TOLERANCE_DB = 1.0
 
@@ -125,7 +125,7 @@ def law(gain: tuple[float, float] = GAIN) -> Integrator:
 
 
 def run_probe(setup: Settings, request: Request) -> tuple[Array, Array, State]:
-    """Errors and commands (frames, modes) of `run_toy` during a probe sequence, and the state afterwards.
+    """Errors and commands (frames, modes), nm, of `run_toy` during a probe sequence, and the state afterwards.
 
     The disturbance is white noise and a slow sine that is not a line of the multisine.
     """
@@ -145,8 +145,8 @@ def run_probe(setup: Settings, request: Request) -> tuple[Array, Array, State]:
 )
 def test_the_measured_rejection_agrees_with_theory(target: str, delay_frames: float) -> None:
     setup = settings(delay_frames=delay_frames, gain=GAIN)
-    places = lines(PERIOD, len(NOLL), 12, MIN_CYCLES_OF_LINE / PERIOD, 0.3)
-    period = multisine(PERIOD, places, 3.0, 1)
+    cycles = lines(PERIOD, len(NOLL), 12, MIN_CYCLES_OF_LINE / PERIOD, 0.3)
+    period = multisine(PERIOD, cycles, 3.0, 1)
     lead = settling_frames(law().gain, law().leak)
     table = with_lead_in(period, lead)
     shapes = np.zeros(0) if target == "offset" else calibration().modes_to_actuators.T.reshape(-1)
@@ -157,38 +157,38 @@ def test_the_measured_rejection_agrees_with_theory(target: str, delay_frames: fl
     measured = measure_lines(error_nm[lead:], added)
 
     assert [np.sort(np.round(measured.frequency[measured.mode == mode] * PERIOD)).tolist() for mode in range(3)] == [
-        lines_of_mode.tolist() for lines_of_mode in places
+        cycles_of_mode.tolist() for cycles_of_mode in cycles
     ]
     theory, rows = linear(law(), NOLL, delay_frames, 1.0), np.arange(measured.mode.size)
     transfer = margins.rejection, margins.noise_transfer
     S, T = (function(theory, measured.frequency)[rows, measured.mode] for function in transfer)
-    from_s = departure(measured.rejection, S, measured.error, TOLERANCE_DB)
-    from_t = departure(measured.noise_transfer, T, measured.error, TOLERANCE_DB)
-    assert from_s.judged.sum() > 0.8 * rows.size
-    assert from_t.judged.sum() > 0.5 * rows.size
-    for compared in (from_s, from_t):
+    departure_from_s = departure(measured.rejection, S, measured.error, TOLERANCE_DB)
+    departure_from_t = departure(measured.noise_transfer, T, measured.error, TOLERANCE_DB)
+    assert departure_from_s.judged.sum() > 0.8 * rows.size
+    assert departure_from_t.judged.sum() > 0.5 * rows.size
+    for compared in (departure_from_s, departure_from_t):
         judged = compared.judged
         assert np.array_equal(judged, compared.within)
         assert 0.6 < np.sqrt(np.mean((compared.db[judged] / compared.error_db[judged]) ** 2)) < 1.6
-    assert (np.abs(from_s.db[from_s.judged & (measured.frequency > 0.02)]) < 0.5).all()
+    assert (np.abs(departure_from_s.db[departure_from_s.judged & (measured.frequency > 0.02)]) < 0.5).all()
 
     other_theory = linear(law((0.6, 0.15)), NOLL, delay_frames, 1.0)
     S = margins.rejection(other_theory, measured.frequency)[rows, measured.mode]
-    from_other_gain = departure(measured.rejection, S, measured.error, TOLERANCE_DB)
-    assert not from_other_gain.within[from_other_gain.judged].all()
+    departure_from_other = departure(measured.rejection, S, measured.error, TOLERANCE_DB)
+    assert not departure_from_other.within[departure_from_other.judged].all()
 
 
-def test_lines_are_odd_ascending_and_not_shared_by_modes() -> None:
+def test_lines_have_odd_numbers_of_cycles_ascend_and_are_not_shared_by_modes() -> None:
     for modes in (1, 2, 3, 14):
-        places = lines(15_000, modes, 12, 0.1 / 250, 0.3)
-        all_lines = np.sort(np.concatenate(places))
-        assert all_lines.size == np.unique(all_lines).size == 12 * modes
-        assert (all_lines % 2 == 1).all()
-        assert all_lines[0] >= 0.1 / 250 * 15_000
-        assert all_lines[-1] <= 0.3 * 15_000
-        assert all_lines[-1] > 0.28 * 15_000
-        for lines_of_mode in places:
-            assert (np.diff(lines_of_mode) >= 6).all()
+        cycles = lines(15_000, modes, 12, 0.1 / 250, 0.3)
+        all_cycles = np.sort(np.concatenate(cycles))
+        assert all_cycles.size == np.unique(all_cycles).size == 12 * modes
+        assert (all_cycles % 2 == 1).all()
+        assert all_cycles[0] >= 0.1 / 250 * 15_000
+        assert all_cycles[-1] <= 0.3 * 15_000
+        assert all_cycles[-1] > 0.28 * 15_000
+        for cycles_of_mode in cycles:
+            assert (np.diff(cycles_of_mode) >= 6).all()
 
 
 @pytest.mark.parametrize(
@@ -206,14 +206,14 @@ def test_an_impossible_multisine_is_refused(arguments: tuple[int, int, int, floa
 
 
 def test_a_multisine_has_the_requested_rms_and_lines_and_a_low_crest_factor() -> None:
-    places = lines(4000, 4, 15, 0.001, 0.3)
-    table = multisine(4000, places, 2.0, 5)
+    cycles = lines(4000, 4, 15, 0.001, 0.3)
+    table = multisine(4000, cycles, 2.0, 5)
     assert np.std(table, axis=0) == pytest.approx(2.0, rel=1e-5)
     assert np.std(multisine(1002, lines(1002, 1, 8, 0.004, 0.5), 2.0, 5)) == pytest.approx(2.0, rel=1e-5)
     assert (np.abs(table).max(axis=0) < 3.3 * 2.0).all()
     amplitude = np.abs(np.fft.rfft(table, axis=0))
-    for mode, bins in enumerate(places):
-        assert np.array_equal(np.flatnonzero(amplitude[:, mode] > 1e-3 * amplitude[:, mode].max()), bins)
+    for mode, cycles_of_mode in enumerate(cycles):
+        assert np.array_equal(np.flatnonzero(amplitude[:, mode] > 1e-3 * amplitude[:, mode].max()), cycles_of_mode)
     with_lead = with_lead_in(table, 4500)
     assert np.array_equal(with_lead[500:4500], table)
     assert np.array_equal(with_lead[4500:], table)
@@ -221,12 +221,13 @@ def test_a_multisine_has_the_requested_rms_and_lines_and_a_low_crest_factor() ->
 
 def test_a_vibration_near_a_line_raises_the_standard_error_of_the_line() -> None:
     rng = np.random.default_rng(2)
-    period = multisine(PERIOD, lines(PERIOD, 1, 10, 0.005, 0.3), 2.0, 1).astype(float)
-    place = int(lines(PERIOD, 1, 10, 0.005, 0.3)[0][4])
+    cycles = lines(PERIOD, 1, 10, 0.005, 0.3)
+    period = multisine(PERIOD, cycles, 2.0, 1).astype(float)
+    fifth = int(cycles[0][4])
     time = np.arange(PERIOD)
     error = 0.5 * period + 0.01 * rng.standard_normal(period.shape)
     quiet = measure_lines(error, period)
-    vibrating = measure_lines(error + np.sin(2 * np.pi * (place + 0.4) / PERIOD * time)[:, None], period)
+    vibrating = measure_lines(error + np.sin(2 * np.pi * (fifth + 0.4) / PERIOD * time)[:, None], period)
     assert np.abs(quiet.rejection - 0.5).max() < 0.02
     assert vibrating.error[4] > 10 * quiet.error[4]
     assert abs(vibrating.rejection[4] - 0.5) < 5 * vibrating.error[4]
@@ -254,16 +255,17 @@ def test_the_gain_and_cross_talk_of_a_known_sensor_are_recovered() -> None:
     rng = np.random.default_rng(8)
     levels_nm = levels([4.0, 8.0, 16.0], 8)
     stairs, starts = build_staircase(levels_nm, 8, 10.0)
-    true = np.stack([0.1 * stairs, stairs * (1 - (stairs / 50) ** 2), np.zeros_like(stairs)], axis=1)
+    true_nm = np.stack([0.1 * stairs, stairs * (1 - (stairs / 50) ** 2), np.zeros_like(stairs)], axis=1)
     drift = np.linspace(0, 20, len(stairs))[:, None]
-    measured = gains(true + drift + 0.2 * rng.standard_normal(true.shape), 1, levels_nm, starts + 2, 6)
+    measured = gains(true_nm + drift + 0.2 * rng.standard_normal(true_nm.shape), 1, levels_nm, starts + 2, 6)
     assert measured.amplitude_nm.tolist() == [4, 8, 16]
-    truth = np.stack([np.full(3, 0.1), 1 - (measured.amplitude_nm / 50) ** 2, np.zeros(3)], axis=1)
-    assert (np.abs(measured.gain - truth) < 4 * measured.error).all()
+    true_gain = np.stack([np.full(3, 0.1), 1 - (measured.amplitude_nm / 50) ** 2, np.zeros(3)], axis=1)
+    assert (np.abs(measured.gain - true_gain) < 4 * measured.error).all()
     assert measured.error.max() < 0.02
     assert measured.within(0.05, 0.2) == [True, True, False]
     assert measured.within(0.5, 0.05) == [False] * 3
-    assert gains(true + 30 * rng.standard_normal(true.shape), 1, levels_nm, starts + 2, 6).within(0.05, 0.2)[0] is None
+    too_noisy_nm = true_nm + 30 * rng.standard_normal(true_nm.shape)
+    assert gains(too_noisy_nm, 1, levels_nm, starts + 2, 6).within(0.05, 0.2)[0] is None
 
 
 @pytest.mark.parametrize(("gain", "expected"), [((0.4, 0.3), True), ((0.0, 0.0), False)])

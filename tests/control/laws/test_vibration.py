@@ -23,7 +23,7 @@ SAMPLED = Timing.sampled(1.0)
 
 
 def ideal_wheel() -> TimeSeries:
-    """Tip of the ideal reaction wheel, measured with white noise."""
+    """Tilt Z2 (frames, 1), nm, of the ideal reaction wheel, measured with white noise."""
     simulated = preset_disturbance("reaction-wheel-ideal", (2, 3, 4), 1, NM_PER_MAS, 550.0)
     noise = 0.8 * np.random.default_rng(1).standard_normal((12_000, 1))
     return one_piece(modes_nm(simulated, 0, 12_000, RATE_HZ)[:, :1] + noise)
@@ -62,7 +62,7 @@ def test_no_line_is_identified_in_noise() -> None:
 
 
 def test_the_spectrum_of_a_model_agrees_with_its_states() -> None:
-    """The expected values are from the states' transfer function, which shares no code with `spectrum_nm2`."""
+    """The expected values are from the transfer function of the states, which shares no code with `spectrum_nm2`."""
     model = Model(0.01, 5.0, (Line(20, 0.8, 25.0), Line(60, 2.5, 9.0)), 0.5, RATE_HZ)
     F, Q, C = model.states()
     omega = np.array([0.01, 0.1257, 0.3, 0.377, 2.0])
@@ -84,8 +84,8 @@ def test_lines_are_identified_in_two_pieces_and_not_in_a_piece_that_is_too_short
 
 def test_a_slow_mode_is_identified_as_drift() -> None:
     simulated = preset_disturbance("thermal", (4,), 3, NM_PER_MAS, 550.0)
-    run = modes_nm(simulated, 0, 20_000, RATE_HZ) + 0.5 * np.random.default_rng(3).standard_normal((20_000, 1))
-    model = identify(one_piece(run), RATE_HZ)
+    noise = 0.5 * np.random.default_rng(3).standard_normal((20_000, 1))
+    model = identify(one_piece(modes_nm(simulated, 0, 20_000, RATE_HZ) + noise), RATE_HZ)
     assert all(line.frequency_hz < 1 for line in model.lines)
     assert model.drift_nm2 > 0
     assert model.noise_nm2 == pytest.approx(0.25, rel=0.05)
@@ -138,7 +138,7 @@ def minimum_variance_nm2(spectrum_nm2: Array, noise_nm2: float, whole_frames: in
 
 @pytest.mark.parametrize("delay", [1, 2, 3])
 def test_three_predictions_of_the_residual_agree(delay: int) -> None:
-    """They follow from Riccati's covariance, the law's transfer functions, and the factor of the spectrum."""
+    """They follow from the Riccati equation, the law's transfer functions, and the factored spectrum."""
     (A, Q, C), covariance, timing = MODEL.states(), covariance_nm2(MODEL), Timing.sampled(delay)
     for _ in range(delay - 1):  # further frames without a measurement
         covariance = A @ covariance @ A.T + Q
