@@ -101,7 +101,7 @@ class Rig(ThreadedRun):
             assert self._newest.wait_for(met, PATIENCE_S), f"{what} did not happen"
 
     def put(self, pixels: Pixels, publish_time_ns: int | None = None) -> int:
-        """Publish a frame, and wait until the mirror has answered the command of this frame."""
+        """Publish a frame, and wait until the mirror has reported its state after the command of this frame."""
         time_ns = SIMULATED_START_NS + (self._index + 1) * self.config.period_ns
         self._index += 1
         payload = image(pixels, time_ns, "camera").SerializeToString()
@@ -370,12 +370,12 @@ def test_safe_mode_outlives_the_controller(calibration: Calibration, tmp_path: P
     """The latch is a file; it also acts on a controller without a calibration, once an operator loads one."""
     file = tmp_path / "safe"
 
-    def mode(first: Calibration | None = calibration) -> LoopMode:
+    def mode(at_start: Calibration | None = calibration) -> LoopMode:
         latch = Latch([file])
-        controller = lone_controller(first, latch, CLOSED)[2]
+        controller = lone_controller(at_start, latch, CLOSED)[2]
         controller._update_latch()
         latch.close()  # otherwise it would write the file again
-        if first is None:
+        if at_start is None:
             controller._carry_out_internal(Request(SIMULATED_START_NS, "load", calibration=calibration))
         return mode_of(controller)
 
@@ -397,8 +397,8 @@ def test_a_mirror_with_another_grid_than_the_calibration_is_refused(calibration:
 def test_start_requests_wait_for_the_mirror_and_the_cameras_settings(calibration: Calibration, tmp_path: Path) -> None:
     np.save(tmp_path / "flat.npy", np.ones(GRID, np.float32))
     flat = configured(lockstep=False, mirror__flat=str(tmp_path / "flat.npy"))
-    for first in (None, calibration):
-        listener, _, controller = lone_controller(first, Latch([tmp_path / "safe"]), flat)
+    for at_start in (None, calibration):
+        listener, _, controller = lone_controller(at_start, Latch([tmp_path / "safe"]), flat)
         controller._report_mirror()
         controller._send_start_requests()
         assert controller._start_pending
@@ -454,7 +454,7 @@ def test_a_fault_of_the_mirror_and_another_fault_after_it_count_after_two_health
     listener, _, controller = lone_controller(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     report_shape(listener)
     assert controller._mirror.first() is not None
-    healths = listener.bus.publisher(HEALTH, "mirror-dm")
+    mirror_health = listener.bus.publisher(HEALTH, "mirror-dm")
     expired, refused = wire.Health(command_expired=True), wire.Health(command_refused=99)  # type: ignore[arg-type]
     for health, fault in (
         (refused, ""),
@@ -464,7 +464,7 @@ def test_a_fault_of_the_mirror_and_another_fault_after_it_count_after_two_health
         (expired, "refuses commands: 99"),
         (wire.Health(), ""),
     ):
-        healths.put(health.SerializeToString())
+        mirror_health.put(health.SerializeToString())
         assert controller._mirror.fault(State(commanded=True)) == fault
 
 
@@ -480,12 +480,12 @@ def test_a_warm_up_changes_no_state_publishes_nothing_and_loses_no_settings(
         def counts() -> list[int]:
             return [len(rig.received.get(topic.key, ())) for topic in (STEP, COMMAND, TIMING)]
 
-        def watched(self: Controller) -> None:
+        def checked_warm_up(self: Controller) -> None:
             before, counts_before = self._state, counts()
             original(self)
             unchanged.append(self._state is before and counts() == counts_before)
 
-        monkeypatch.setattr(Controller, "_warm_up", watched)
+        monkeypatch.setattr(Controller, "_warm_up", checked_warm_up)
         for index in range(5):
             pixels = scene.expose(index, rig.offset_nm)
             rig.put(pixels)
@@ -513,8 +513,8 @@ def test_an_exception_in_frame_processing_ends_the_controller(
     late.join()
 
 
-def test_of_frames_that_waited_only_the_newest_is_integrated(calibration: Calibration, scene: Scene) -> None:
-    """All saw the same mirror shape: the command may change by gain times error once, not ten times."""
+def test_only_the_newest_of_the_queued_frames_is_integrated(calibration: Calibration, scene: Scene) -> None:
+    """All ten saw the same mirror shape, so that the command may change by gain times error once, not ten times."""
     # 5 Hz, so that a stall of this host is shorter than a period.
     config = configured(lockstep=False, camera__rate_hz=5.0, control__start_mode="closed")
     with running(config, calibration, scene) as rig:
@@ -548,7 +548,7 @@ def test_refused_commands_do_not_reset_the_command_timeout(
         rig.services[0].stop("the controller has died")
         rig.threads[0].join(PATIENCE_S)
         another_publisher = rig.bus("other").publisher(COMMAND, "dm")
-        nonsense = wire.MirrorCommand(
+        refused_command = wire.MirrorCommand(
             rows=GRID[0], columns=GRID[1], actuators=actuators, frame_sequence=2**63, valid_for_ns=10**9
         ).SerializeToString()
-        until(lambda: "COMMAND_EXPIRED" in rig.events(), each=lambda: another_publisher.put(nonsense))
+        until(lambda: "COMMAND_EXPIRED" in rig.events(), each=lambda: another_publisher.put(refused_command))

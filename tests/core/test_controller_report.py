@@ -129,7 +129,7 @@ def test_summary_and_status_show_the_time_not_closed() -> None:
     holding = {"controller": wire.Health(holding="no frame comes")}
     held = status.text(status.json_object(message, holding)).splitlines()[1]
     assert " open for 12 s (" in held
-    assert held.endswith("), not correcting: no frame comes"), "12 s is the time open, not the time without frames"
+    assert held.endswith("), not correcting: no frame comes"), "12 s since the loop opened, not since the last frame"
     expired = {"mirror-x": wire.Health(command_expired=True)}
     assert status.json_object(message, expired)["mirrors"]["mirror-x"]["expired"]
 
@@ -171,7 +171,7 @@ def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> Non
 
 
 @pytest.mark.parametrize(("count", "names"), [(99, ("p50", "max")), (100, ("p50", "p99", "max"))])
-def test_a_summary_has_no_percentile_that_is_only_the_maximum_of_few_values(count: int, names: tuple[str, ...]) -> None:
+def test_a_summary_omits_a_percentile_that_equals_the_maximum_of_few_values(count: int, names: tuple[str, ...]) -> None:
     latency = wire.Latency(count=count, p50_ns=1000, p99_ns=2000, p99_9_ns=2000, max_ns=2000)
     received = wire.TopicCount(topic=FRAME.key, received=count)
     controller = wire.Health(topics=[received], frame_to_command=latency)
@@ -263,7 +263,7 @@ def test_the_status_line_shows_recent_statistics_and_none_before_the_first_frame
     shown = console.export_text()
     assert "2.20" not in shown, "statistics seven seconds old are not shown"
     assert "bench, V = 2, zwfs; 17 s" in shown
-    assert "closed (not correcting: reserved for [/b])" in shown, "text of an operator is not rich's markup"
+    assert "closed (not correcting: reserved for [/b])" in shown, "an operator's text is not interpreted as markup"
 
 
 @pytest.mark.parametrize(("received", "missing", "lost"), [(500, 0, 0), (371, 129, 129), (309, 0, 191), (0, 0, 0)])

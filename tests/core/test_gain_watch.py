@@ -185,7 +185,7 @@ def test_the_command_of_a_mode_with_automatic_gain_zero_relaxes_to_zero() -> Non
 
 
 def _contrast_relative_to_open_loop(magnitude: float, seed: int, frames: int) -> float:
-    """Ratio of the residual's contrast to that in open loop: Zernike sensor, reaction wheels, second half of a run."""
+    """Contrast of the residual divided by that of the disturbance, second half of a run with a Zernike sensor."""
     loop = bench(magnitude, "reaction-wheel", "zwfs", seed=seed)
     form = np.diag(factory.contrast_of(loop.config).form)
     loop.run(frames - frames // 2, record=False)
@@ -219,7 +219,7 @@ def test_a_decoded_state_has_the_same_reconstructor(faint: Bench) -> None:
 
 
 def test_a_state_decoded_before_gains_are_measured_has_the_same_law() -> None:
-    """An operator may close the loop before the gains are measured: a replay must continue with the same command."""
+    """An operator may close the loop before the gains are measured; a replay must then give the same commands."""
     loop = bench(2.0)
     active_loop, message = loop.state.loop, controller_state(loop.state, loop.settings, 1)
     decoded_loop = decode_state(message, active_loop.calibration)[1].loop
@@ -237,7 +237,7 @@ def test_tilt_cross_talk_uses_the_tilt_on_the_sensor_including_the_offset() -> N
 
 
 def test_added_contrast_is_measured_in_open_and_closed_loop() -> None:
-    # At V = 2 the noise of a frame is some ten times the residual: the estimate would scatter by a factor of 4.
+    # A bright star: at V = 2 the noise of a frame is some ten times the residual, and the estimate scatters fourfold.
     loop = bench(-1.0)
     form = np.diag(factory.contrast_of(loop.config).form)
 
@@ -327,8 +327,8 @@ def test_a_mode_can_have_a_manual_gain_and_return_to_automatic() -> None:
 def test_a_truncated_reconstructor_is_weighted_without_an_inverse_of_its_response() -> None:
     setup, R = settings(auto_gain=(True, True)), toy_calibration().reconstructor * np.array([[1], [1], [0]], np.float32)
     load = Load(0, replace(toy_calibration(), reconstructor=R), "test")
-    gains = Request(0, "gain", (), (0.0, 0.4, 0.1), "auto", prior_nm2=(4.0, 0.0, 0.0), flux_dn=FLUX_DN)
-    state, all_outputs = feed(setup, State(), CAMERA, load, gains, frame(1))
+    request = Request(0, "gain", (), (0.0, 0.4, 0.1), "auto", prior_nm2=(4.0, 0.0, 0.0), flux_dn=FLUX_DN)
+    state, all_outputs = feed(setup, State(), CAMERA, load, request, frame(1))
     assert state.loop.weighting is not None
     assert GainWatch(setup, "warn").observe(all_outputs[-1].step, state).requests == ()
 

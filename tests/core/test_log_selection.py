@@ -1,4 +1,4 @@
-"""Recordings and copies with every Nth frame and mirror state: contents, and which commands can read them."""
+"""Recordings and copies of logs with every Nth frame and mirror state: contents, and which commands accept them."""
 
 from pathlib import Path
 
@@ -43,6 +43,7 @@ EVERY, FRAMES = 10, 1200
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log with all frames and mirror states."""
     night = SyntheticLog().request("close").frames(FRAMES)
     night.health("camera", topics=[wire.TopicCount(topic=FRAME.key, published=FRAMES)], state="stopped")
     return night.write(tmp_path_factory.mktemp("night") / "night.mcap")
@@ -50,6 +51,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def small(whole: Path) -> Path:
+    """A copy of the log `whole` with every tenth frame and mirror state."""
     out = whole.with_name("small.mcap")
     done = thin((whole,), out, Selection(EVERY))
     assert done["bytes"] < 0.8 * done["bytes_before"]
@@ -75,7 +77,7 @@ def test_steps_and_commands_are_never_left_out() -> None:
 
 
 def test_every_tenth_frame_is_recorded_and_the_others_do_not_count_as_lost(bench: Bench) -> None:
-    """Mirror states are selected by their frame's number. A message not received counts as lost, selected or not."""
+    """Mirror states are selected by the number of their frame. A frame not received counts as lost, selected or not."""
     frames, commands = bench.camera.publisher(FRAME), bench.controller.publisher(COMMAND, "dm")
     mirror = bench.service("mirror-dm")
     states, surfaces = mirror.publisher(MIRROR_STATE, "dm"), mirror.publisher(SURFACE, "dm")

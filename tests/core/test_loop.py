@@ -35,7 +35,7 @@ def calibration() -> Calibration:
 def test_the_limiting_gain_is_accurate_to_one_percent(
     delay: int, factor: float, stable: bool, calibration: Calibration
 ) -> None:
-    """It is 2 sin(pi / (2 (2d - 1))) for a delay of d frames. The images are noiseless, with a tilt below 1 mas."""
+    """For a delay of d frames it is 2 sin(pi / (2 (2d - 1))). The images are noiseless, with a tilt below 1 mas."""
     gain = factor * 2 * np.sin(np.pi / (2 * (2 * delay - 1)))
     assert limiting_gain(delay) == pytest.approx(gain / factor, rel=1e-9)
     start_nm = 0.2 * tilt_nm_per_mas(2.0)
@@ -50,7 +50,7 @@ def test_the_limiting_gain_is_accurate_to_one_percent(
 
 
 def test_a_kolmogorov_screen_is_corrected_up_to_the_controlled_modes() -> None:
-    """The screen has 0.05 waves rms, as in case (3) of the paper; high orders remain, of more than a third."""
+    """The screen has 0.05 waves rms, as in case (3) of the paper; more than a third of that is of higher orders."""
     run = run_loop(configured(disturbance__preset="kolmogorov", control__gain=0.2, control__tilt_gain=0.3), 150)
     assert run.disturbance_rms_nm[-1] == pytest.approx(0.05 * 550, rel=1e-5)
     assert 0.35 < run.residual_rms_nm[-1] / run.disturbance_rms_nm[-1] < 0.6

@@ -14,12 +14,12 @@ from tools.no_harm import TOLERATED
 OPTIONS = "--lockstep --rate 250 --duration 20 --disturbance bench --no-record"
 
 
-@pytest.mark.parametrize(("why", "recorded"), [("the star saturates the sensor: ...", True), ("no light", False)])
-def test_a_star_that_saturates_the_sensor_is_recorded_and_other_errors_are_raised(
-    why: str, recorded: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("why", "is_result"), [("the star saturates the sensor: ...", True), ("no light", False)])
+def test_a_star_that_saturates_the_sensor_is_a_result_and_other_errors_are_raised(
+    why: str, is_result: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(no_harm, "_noise_nm2", Mock(side_effect=CalibrationError(why)))
-    with contextlib.nullcontext() if recorded else pytest.raises(CalibrationError, match=why):
+    with contextlib.nullcontext() if is_result else pytest.raises(CalibrationError, match=why):
         assert no_harm.modal_case(("sam", "bench", 0))["saturates"] == why
 
 
