@@ -244,7 +244,7 @@ def test_a_permit_is_refused_during_a_lease_or_a_probe_sequence() -> None:
     check_reply(outputs, False, "at most 60 s")
 
 
-def test_a_renewed_permit_still_holds() -> None:
+def test_a_renewed_permit_still_holds_the_command() -> None:
     setup = settings_under(Action.WARN)
     state, _ = permit(setup, running(setup), 5.0)
     state, outputs = applied(setup, state, "renew", text="moving the mask", values=(5.0,), lease_id=MOVER)

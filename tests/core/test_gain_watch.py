@@ -85,6 +85,7 @@ def gain_bank_responses() -> list[Array | Single]:
 
 @pytest.fixture(scope="module")
 def faint(gain_bank_responses: list[Array | Single]) -> Bench:
+    """A loop on a faint star, after the frames in which it measured its gains and closed."""
     with patch.object(GainBank, "use_reconstructor", autospec=True, side_effect=GainBank.use_reconstructor) as used:
         loop = bench(6.5)
         loop.run(1200)

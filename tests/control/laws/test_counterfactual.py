@@ -23,7 +23,7 @@ WIDE = {"limits": Limits(7000.0, 7000.0, 7000.0), "limit_nm": (5000.0, 5000.0)}
 DELAYS = [1.0, 1.4, 2.0, 3.0]
 WALK = np.array([15.0, -9.0, 6.0]) + np.cumsum(np.random.default_rng(4).normal(size=(160, 3)), axis=0)
 MISSING = (30, 31, 32, 33, 34, 35, 60, 90, 91)  # numbers of missing frames
-DARK = (45, 46, 100, 101, 102, 103)  # numbers of refused frames
+DARK = (45, 46, 100, 101, 102, 103)  # numbers of frames without light, which are refused
 
 
 def one_mode(*values: float) -> np.ndarray:

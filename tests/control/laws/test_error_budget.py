@@ -26,7 +26,7 @@ def law_of_two_modes(gain: tuple[float, ...] = (0.5, 0.1), leak: tuple[float, ..
     return integrator(gain, leak, (2, 3), 1.0, RATE_HZ)
 
 
-def test_the_noise_of_a_loop_with_one_frame_of_delay_has_a_closed_form() -> None:
+def test_the_noise_of_a_loop_with_one_frame_of_delay_agrees_with_its_closed_form() -> None:
     noise = white_noise(law_of_two_modes((0.5, 0.1)), np.array([4.0, 2.0]), SAMPLED)
     assert noise.variance_nm2 == pytest.approx([16 * 0.5 / 1.5, 4 * 0.1 / 1.9], rel=1e-3)
 
