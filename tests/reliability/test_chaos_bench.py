@@ -137,12 +137,12 @@ def test_a_camera_with_another_clock_is_replaced_by_a_camera_with_the_hosts_cloc
     ]
 
 
-def test_the_random_case_restarts_killed_processes_and_continues_stopped_ones() -> None:
+def test_the_random_case_restarts_killed_processes_and_continues_suspended_ones() -> None:
     mock_bench = MagicMock(spec=ChaosBench, rng=random.Random(3), process=str)  # noqa: S311
     CASES["random"].act(mock_bench)
     actions = " ".join(done[0] for done in mock_bench.mock_calls if done[0] != "pause")
-    stopped = r"stopped stopped\(\).__enter__ stopped\(\).__exit__"
-    assert re.fullmatch(rf"((kill restart|{stopped})( |$)){{{processes.RANDOM_FAULTS}}}", actions)
+    suspended = r"suspended suspended\(\).__enter__ suspended\(\).__exit__"
+    assert re.fullmatch(rf"((kill restart|{suspended})( |$)){{{processes.RANDOM_FAULTS}}}", actions)
     assert mock_bench.suspended.called
     assert mock_bench.kill.call_args_list == mock_bench.restart.call_args_list != []
 
