@@ -143,5 +143,5 @@ def _number(key: str, value: str) -> float:
     except ValueError:
         raise ConfigurationError(f"--set: {key} must be a number, got {value!r}") from None
     if abs(number) > MAX_LIMIT_NM:  # larger numbers may overflow in single precision
-        raise ConfigurationError(f"--set: {key} must be at most {MAX_LIMIT_NM:g}, got {value}")
+        raise ConfigurationError(f"--set: {key} must be between -{MAX_LIMIT_NM:g} and {MAX_LIMIT_NM:g}, got {value}")
     return number
