@@ -107,7 +107,7 @@ def tables(found: Result) -> list[Lines]:
 
 
 def about(found: Result) -> str:
-    """Duration of the step relative to one product, its size, and the memory that it allocates."""
+    """Duration of the step relative to one product, the size of the loop, and the memory that a step allocates."""
     ratios, memory, size = found["over_product"], found["memory"], Size()
     return (
         f"The step takes {ratios['hot_us']:.1f} times as long as one product back to back, "

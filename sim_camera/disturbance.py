@@ -346,7 +346,7 @@ def _thermal_nm(noll: tuple[int, ...]) -> Array:
 
 
 def _drift(rng: np.random.Generator, rms_nm: Array, band_hz: tuple[float, float]) -> tuple[Array, Complex]:
-    """Sine waves about even in log(frequency), power per hertz falling as 1/f^2; their sum has `rms_nm` (modes,)."""
+    """Sine waves nearly even in log(frequency), power per hertz as 1/f^2; their sum has rms `rms_nm` (modes,)."""
     frequencies = np.geomspace(*band_hz, _WAVES_PER_BAND) * rng.uniform(0.95, 1.05, _WAVES_PER_BAND)
     weights = frequencies**-0.5
     weights *= np.sqrt(2 / np.sum(weights**2))

@@ -89,8 +89,8 @@ ADVICE: dict[str, tuple[str, str]] = {
     ),
     "GAINS_CHANGED": ("automatic gains changed.", _NOTHING),
     "STAR_CHANGED": (
-        "the flux changed by more than 20 % for half a second and 20 frames; automatic gains are lowered and measured "
-        "again.",
+        "the flux changed by more than 20 % for half a second and at least 20 frames; automatic gains are lowered and "
+        "measured again.",
         "nothing after a slew; else check for clouds, a vignetted beam or a changed exposure.",
     ),
     "LOOP_HARMS": (

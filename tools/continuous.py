@@ -47,7 +47,7 @@ def table() -> str:
 
 
 def kalman(timing: Timing, start: float, length: float) -> LinearLaw:
-    """Kalman filter of the exact lines; nulls the mean error of `length` periods, `start` after an exposure's start."""
+    """Kalman filter of the exact lines; its command nulls the mean error from `start` to `start + length` (periods)."""
     predicted_mean = WHEEL.mean_over(start, length) @ np.linalg.inv(WHEEL.mean_over(0.0, timing.exposure))
     return replace(lqg([WHEEL], (2,), timing), output=(-WHEEL.states()[2] @ predicted_mean)[None].astype(np.float32))
 

@@ -186,11 +186,12 @@ def render(results: Results) -> str:
         f"{markdown(head, rows)}\n{markdown(lqg_head, map(_lqg_row, results['cases'].items()))}\nReaction wheel with "
         f"damped lines, 14 mas rms per axis, V = 0 unless stated, {RATE_HZ:g} Hz; the residual is the true tilt in "
         "continuous time (8 samples in each frame). The live loop's own `advance` processes blurred sensor images. "
-        f"Laws are identified from {IDENTIFY / RATE_HZ:g} s of the closed loop and measured over {MEASURE / RATE_HZ:g} "
-        f"s, {SETTLE / RATE_HZ:g} s after they were loaded. Exact lines: the residual of an LQG law with the exact "
-        "lines of the wheel, and a random walk behind a low-pass as drift. Theory: both parts of the first table, "
-        "added in quadrature; identified from 8 or 16 s: of laws from the last 8 or 16 s of these frames. Lines 2 % "
-        "higher: the residual of the LQG law when the lines have moved, and after identification from that run."
+        f"Laws are identified from {IDENTIFY / RATE_HZ:g} s of the closed loop; the residual is measured over "
+        f"{MEASURE / RATE_HZ:g} s, {SETTLE / RATE_HZ:g} s after a law was loaded. Exact lines: the residual of an LQG "
+        "law with the exact lines of the wheel, and a random walk behind a low-pass as drift. Theory: both parts of "
+        "the first table, added in quadrature; identified from 8 or 16 s: of laws from only the last 8 or 16 s of "
+        "that time. Lines 2 % higher: the residual of the LQG law when the lines have moved, and after identification "
+        "from that run."
     )
 
 

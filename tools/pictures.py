@@ -33,7 +33,7 @@ SMALL_WELL = {"control.start_mode": "closed", "camera.full_well_e": 1500.0}
 
 
 def picture(name: str, source: str, *options: str, meanwhile: Callable[[], object] | None = None) -> None:
-    """Take a picture of a run or a log, and store it in the documentation; `meanwhile` runs before the picture."""
+    """Take a picture of a run or a log, and store it in the documentation; `meanwhile` is called beside the view."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / f"{name}.png"
         command = [sys.executable, "-m", "lowfc", "view", *source.split(), "--headless-screenshot", str(out), *options]

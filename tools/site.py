@@ -148,7 +148,7 @@ def _subclasses(kind: type[Result]) -> set[type[Result]]:
 
 
 def former_names() -> str:
-    """Every name that has changed since release 0.1, and the present name."""
+    """Configuration keys, message fields, values and law extensions renamed since release 0.1."""
     tables = {
         "configuration key": KEYS,
         "field of a message": FIELDS,

@@ -29,13 +29,13 @@ MessageFunction = Callable[[int, bytes], None]
 """Receives or sends a message: frame number, payload."""
 
 
-def join(part: RoleProcess, receive: MessageFunction) -> MessageFunction:
+def join(role_process: RoleProcess, receive: MessageFunction) -> MessageFunction:
     """Join a run with a session set up as lowfc's; returns the function that sends."""
-    ports = json.loads((part.folder / PORTS).read_text())
-    links = Links("peers", ports, "lowfc", part.folder / "credentials")
-    session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(links, _ROLES[part.role]))))
+    ports = json.loads((role_process.folder / PORTS).read_text())
+    links = Links("peers", ports, "lowfc", role_process.folder / "credentials")
+    session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(links, _ROLES[role_process.role]))))
     keys = FRAME.key, COMMAND.at("dm")
-    sent, received = keys if part.role == "source" else keys[::-1]
+    sent, received = keys if role_process.role == "source" else keys[::-1]
 
     def on_sample(sample: zenoh.Sample) -> None:
         attachment = sample.attachment
@@ -52,32 +52,36 @@ def join(part: RoleProcess, receive: MessageFunction) -> MessageFunction:
     return put
 
 
-def source(part: RoleProcess) -> None:
+def source(role_process: RoleProcess) -> None:
     """Send the frames, and record when their commands arrive."""
-    received, published, now_ns = part.time_stamps("received"), part.time_stamps("published"), time.monotonic_ns
-    last = part.last_actuators()
+    received, published, now_ns = (
+        role_process.time_stamps("received"),
+        role_process.time_stamps("published"),
+        time.monotonic_ns,
+    )
+    last = role_process.last_actuators()
 
     def record_command(number: int, payload: bytes) -> None:
         received[number] = now_ns()
         last[:] = np.frombuffer(payload, np.float32)
 
-    payloads = [pixels.tobytes() for pixels in RunData(part.folder).frames]
-    put = join(part, record_command)
-    for number in part.frame_numbers():
+    payloads = [pixels.tobytes() for pixels in RunData(role_process.folder).frames]
+    put = join(role_process, record_command)
+    for number in role_process.frame_numbers():
         published[number] = now_ns()
         put(number, payloads[number % len(payloads)])
 
 
-def controller(part: RoleProcess) -> None:
+def controller(role_process: RoleProcess) -> None:
     """Answer frames until the process is killed."""
-    commanded, step = part.time_stamps("commanded"), NumpyStep(RunData(part.folder))
+    commanded, step = role_process.time_stamps("commanded"), NumpyStep(RunData(role_process.folder))
 
     def answer(number: int, payload: bytes) -> None:
         put(number, step.command(payload))
         commanded[number] = time.monotonic_ns()
 
-    put = join(part, answer)
-    part.ready()
+    put = join(role_process, answer)
+    role_process.ready()
     threading.Event().wait()
 
 

@@ -92,7 +92,7 @@ DECLARED: tuple[Declaration, ...] = (
     _declared(
         "play",
         "Play a probe sequence: one row of a table per frame, from the frame in the answer to the end of the table. "
-        "Shapes played on the mirror are unknown to the control law; those on the offset change the loop's target.",
+        "Rows played on `mirror` are unknown to the control law; rows played on `offset` change the loop's target.",
         "",
         ("text", "`mirror` or `offset`"),
         ("table", "float32, frames x columns: factors of the shapes, or nm rms of wavefront of each mode"),

@@ -89,7 +89,7 @@ class Control(Section):
     """Largest modal command of the other modes, wavefront rms."""
     max_frame_age_ms: Milliseconds = 0.0
     """Age above which a frame is refused; 0: 20 ms or two frame periods, whichever is longer. In any case a frame is
-    refused if its age on arrival is above both 5 ms and three periods, or, if it waited behind another, one period."""
+    refused at an age on arrival of 5 ms or three periods, the longer; if it waited behind another, of one period."""
     frame_timeout_ms: Milliseconds = 0.0
     """Time without a frame after which an event is raised; 0: 50 ms or five frame periods, whichever is longer."""
     on_frame_timeout: Literal["hold", "flat"] = "hold"

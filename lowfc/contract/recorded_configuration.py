@@ -31,7 +31,7 @@ def recorded(content: bytes) -> tuple[Configuration, list[str]]:
         renamed_keys(data)
     remarks: list[str] = []
     while faults := _faults(data):
-        # Faults of no single key are contradictions between keys, reported by the validator of a section.
+        # A fault that belongs to no single key is a contradiction between keys, reported by the validator of a section.
         single_key = [detail for detail in faults if len(detail["loc"]) > 1 or detail["type"] != "value_error"]
         if not single_key:
             remarks += [f"{explain(detail)}; used as recorded" for detail in faults]

@@ -217,8 +217,8 @@ class Disturbance(Section):
     """Rate of change of the wheel's speed: ramp, Hz per second; walk, Hz per root second; run-down, decrease at time 0
     in Hz per second. 0 for constant speed."""
     second_wheel_hz: Signed = 0.0
-    """Difference of a second, identical wheel's initial speed from the first's, turns per second; the two beat. 0: no
-    second wheel."""
+    """Initial speed of a second, identical wheel minus that of the first, turns per second; the two beat. 0: no second
+    wheel."""
 
     @model_validator(mode="after")
     def _possible(self) -> "Disturbance":
@@ -275,7 +275,7 @@ class Mirror(Section):
     active: str = ""
     """Map of the active actuators (FITS or .npy), 0 or 1: modes and flat map exclude the others; empty for all."""
     nm_per_unit: float = Field(1.0, ge=1e-9, le=1e9)
-    """nm of surface per unit written, for your own driver or one with `lowfc.device.VoltMap`; isio has its own."""
+    """nm of surface per unit written, for your own driver or one with VoltMap; isio has an option of this name."""
     shift_pitches: float = Field(0.0, ge=-2, le=2)
     """Simulated mirror: misregistration of its actuators along x and along y, pitches."""
     magnification: float = Field(1.0, ge=0.9, le=1.1)

@@ -9,7 +9,7 @@ MAX_BYTES = 1 << 20
 
 _MAX_DOTS = 100  # in a line: the time to parse a dotted key grows with the square of the number of its parts
 _NUMBER = re.compile(r"[0-9]\.[0-9_]++(?:[eE][+-]?[0-9_]++)?(?![\w.-])")
-"""A number with a fraction; its dot is not counted. In a dotted key of digits, about half of the dots are, or more."""
+"""A number with a fraction; its dot is not counted. In a dotted key of digits, at least half of the dots are."""
 
 
 def parsed(content: bytes) -> dict[str, Any]:

@@ -16,7 +16,7 @@ def fine_grid(zone: Wedge) -> tuple[Array, Mask]:
 
 
 def first_points(zone: Wedge, step: float) -> Array:
-    """Points (n, 2), x and y, where the first linear program limits the field: a square grid in the zone, its edges."""
+    """Points (n, 2), x and y, where the first linear program limits the field: a square grid, and the edges."""
     axis = _axis(step, zone.outer)
     y, x = np.nonzero(_inside(zone, axis))
     points = np.concatenate([np.column_stack([axis[x], axis[y]]), edge_points(zone, step)])

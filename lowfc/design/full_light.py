@@ -34,7 +34,7 @@ class FocalLight:
         forms: Quadratic forms of the pupil.
         fields: By wavelength, nm: (1 + modes, k, k) fields on the mask, of the pupil and of the pupil times each mode.
         wavefronts_nm: By the number of modes, (wavefronts, modes) random wavefronts matched to Table 3's input.
-        aberrated: By the number of modes, (wavefronts, k, k) their fields on the mask, at the central wavelength.
+        aberrated: By the number of modes, (wavefronts, k, k) their fields on the mask at the central wavelength.
     """
 
     forms: PupilForms

@@ -15,12 +15,14 @@ coefficient lies between minus and plus its bound."""
 _BLOCK = 100  # wavefronts in memory at once
 
 
-def bounds_waves(nolls: Sequence[int], low: float, high: float) -> Array:
-    """Bound (modes,) of each coefficient in waves rms: `low` for radial degrees 1 and 2, `high` above."""
-    return np.array([low if noll_to_orders(noll)[0] <= 2 else high for noll in nolls])
+def bounds_waves(nolls: Sequence[int], to_degree_2: float, above: float) -> Array:
+    """Bound (modes,) of each coefficient in waves rms: `to_degree_2` for radial degrees 1 and 2, `above` for others."""
+    return np.array([to_degree_2 if noll_to_orders(noll)[0] <= 2 else above for noll in nolls])
 
 
-def random_wavefronts(rng: np.random.Generator, count: int, nolls: Sequence[int], low: float, high: float) -> Array:
+def random_wavefronts(
+    rng: np.random.Generator, count: int, nolls: Sequence[int], to_degree_2: float, above: float
+) -> Array:
     """Coefficients (count, modes) in waves rms, uniform between minus and plus `bounds_waves` (Sect. 3.1).
 
     They are stratified: each coefficient has one value in each of `count` equal parts of its range, in random order.
@@ -28,7 +30,7 @@ def random_wavefronts(rng: np.random.Generator, count: int, nolls: Sequence[int]
     """
     strata = rng.permuted(np.tile(np.arange(count), (len(nolls), 1)), axis=1).T
     unit = 2.0 * (strata + rng.uniform(size=strata.shape)) / count - 1.0
-    return np.asarray(unit * bounds_waves(nolls, low, high))
+    return np.asarray(unit * bounds_waves(nolls, to_degree_2, above))
 
 
 def noisy_e(rng: np.random.Generator, mean_e: ArrayLike, read_noise_e: float) -> Array:

@@ -256,7 +256,7 @@ def test_monitors_connect_by_port_if_the_socket_path_is_too_long(tmp_path: Path)
 
 
 @pytest.mark.exclusive
-def test_a_monitor_receives_every_truth_and_frames_at_display_rate(join: Join) -> None:
+def test_a_monitor_receives_every_truth_message_but_frames_only_at_display_rate(join: Join) -> None:
     camera, viewer, recorder = join("camera"), join("viewer", monitor=True), join("recorder")
     frames, truths = camera.publisher(FRAME), camera.publisher(TRUTH)
     frame_ring, truth_ring, recorded = viewer.ring(FRAME, 5000), viewer.ring(TRUTH, 5000), Mailbox()
@@ -340,7 +340,7 @@ def test_a_suspended_subscriber_does_not_delay_the_others(reader: Reader, join: 
     join("controller").subscribe(FRAME, box.put)
     until(lambda: box.take(0.01), each=reader.put)
     reader.process.send_signal(signal.SIGSTOP)
-    for _ in range(1500):  # 19 MB, more than the link can buffer; a blocking put would close the link
+    for _ in range(1500):  # 19 MB, more than the link can buffer; if put blocked, zenoh would close the link
         reader.put()
         assert box.take(PATIENCE_S)
     reader.process.send_signal(signal.SIGCONT)

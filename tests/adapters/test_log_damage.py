@@ -79,7 +79,7 @@ def test_a_damaged_log_yields_no_false_message_and_no_silent_loss(tmp_path: Path
 
 
 def chunk_headers(size: int, content: bytes) -> bytes:
-    """A chunk header every 64 bytes; each chunk begins with `content`, and its stated length is nearly all the rest."""
+    """A chunk header every 64 bytes, each of a chunk that begins with `content` and is said to end near the end."""
     file = b""
     for at in range(0, size, 64):
         length = max(size - at - 9, 43)
@@ -268,7 +268,7 @@ def test_a_file_appended_to_a_log_is_damage(source: Path) -> None:
     assert [damage.why for damage in reader.damage] == ["the summary is damaged, or another file was appended"]
 
 
-def test_a_message_index_of_an_impossible_length_is_damage_for_a_sparse_reader_too(source: Path) -> None:
+def test_a_message_index_of_an_impossible_length_is_damage_even_if_chunks_are_skipped(source: Path) -> None:
     data = source.read_bytes()
     begin = next(start for start in boundaries(data) if data[start] == Opcode.MESSAGE_INDEX)
     changed(source, begin + 1, (1 << 63).to_bytes(8, "little"))

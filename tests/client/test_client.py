@@ -340,7 +340,7 @@ def test_a_wait_for_a_run_without_processes_reports_the_other_runs(listen: Calla
     assert waiting_message("bnch").endswith("on this host yet; running: bench (did you mean 'bench'?)")
 
 
-def test_the_message_about_an_absent_process_says_whether_it_is_starting_stopped_or_of_a_former_run(
+def test_the_message_about_an_absent_process_names_a_start_a_stop_or_a_restarted_run(
     listen: Callable[..., None],
 ) -> None:
     open_run("night", listeners=(Role.LAUNCHER,))

@@ -321,5 +321,8 @@ def test_a_test_in_a_log_is_evaluated_with_the_gains_and_the_calibration_in_use_
 
 def test_malformed_modes_and_options_without_effect_on_a_log_are_refused() -> None:
     for test in ("rejection", "linearity", "capture-range"):
-        for given, why in (("--modes", "11-4"), "takes Noll indices"), (("x.mcap", "--modes", "4"), "has no effect"):
+        for given, why in (
+            (("--modes", "11-4"), "takes Noll indices"),
+            (("x.mcap", "--modes", "4"), "--modes has no effect"),
+        ):
             assert why in refusal("acceptance", test, *given, kind=ConfigurationError)

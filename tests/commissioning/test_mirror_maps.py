@@ -223,7 +223,7 @@ def test_the_flat_map_is_applied_during_and_after_a_permit_that_began_before_the
     assert advance(settings, state, request)[1].reply.accepted
 
 
-def test_a_permit_holds_the_flat_map_of_a_closed_loop_whose_mirror_reports_late(
+def test_a_permit_delays_the_flat_map_of_a_closed_loop_whose_mirror_reports_late(
     tmp_path: Path, calibration: Calibration
 ) -> None:
     keys = FIXED_GAINS | {"mirror.flat": saved(tmp_path, "flat.npy", wavy(120.0)), "control.start_mode": "closed"}
@@ -254,7 +254,7 @@ def test_a_restarted_controller_does_not_apply_the_flat_map_twice(
     sent, names = commands(config, state)
     for shape in sent:
         np.testing.assert_allclose(shape, mirror_nm, atol=2e-3)
-    # Without a report, the adopted modal command includes the flat map's modes, and the channel ADOPTED cancels them.
+    # If no modal command is reported, the adopted one has the flat map's modes, and the channel ADOPTED cancels them.
     assert names == ([FLAT] if command_reported else [ADOPTED, FLAT])
 
 

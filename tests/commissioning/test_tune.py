@@ -194,7 +194,7 @@ def test_a_loop_that_was_closed_for_just_enough_frames_and_then_opened_is_tuned_
 def test_a_reconstructor_with_a_prior_for_uncorrected_modes_is_reported_and_a_flat_map_is_not(
     closed: SyntheticLog, tmp_path: Path
 ) -> None:
-    """The prior is the power of a mode without a gain; a gain for Z4 would remove it, and the noise of others rises."""
+    """The prior is the power of a mode without a gain. A gain for Z4 would remove it, and R would have more noise."""
     night = closed.copy()
     night.change(CONTROLLER_STATE, -1, lambda state: state.prior_nm2.extend([0, 0, 4]))
     night.change(CONTROLLER_STATE, -1, lambda state: state.channels.add(name="flat"))

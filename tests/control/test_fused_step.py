@@ -32,9 +32,9 @@ SAME_NM = 2e-4
 LIMITED_NM = 5e-4
 """Allowed difference if the neighbour limit acts, which divides by small differences: up to 2.4e-4 nm on AMD EPYC."""
 ROUNDINGS = 10
-"""Allowed difference in float32 roundings of a step's largest number, which reaches 500 nm if pixels never saturate."""
+"""Allowed difference in float32 roundings of a step's largest number: up to 500 nm if no pixel counts as saturated."""
 COMMAND_ARRAYS = 2
-"""Number of the first arrays of `_numbers` that are commands."""
+"""Number of arrays, the first of `_numbers`, that are commands."""
 BAD_IMAGES = ("dark", "faint", "saturated pixel", "saturated pixels", "frozen", "aberrated")
 pytestmark = pytest.mark.skipif(not compiled.available(), reason="needs the extra `fast`")
 

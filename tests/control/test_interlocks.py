@@ -221,9 +221,8 @@ def test_a_permit_is_granted_while_the_loop_is_not_closed() -> None:
             check_reply(outputs, True, f"the loop is {state.mode.in_words}")
         _, outputs = applied(setup, after, "close" if name == "open" else "clear")
         check_reply(outputs, False, "reserved for moving the mask")
-    check_reply(
-        outputs, False, "`lowfc ctl stop` ends that"
-    )  # `stop` ends it in every mode, while `open` is refused in safe mode
+    # `stop` ends it in every mode, while `open` is refused in safe mode.
+    check_reply(outputs, False, "`lowfc ctl stop` ends that")
     state, _ = applied(setup, after, "stop")
     check_reply(applied(setup, state, "clear")[1], True)
 

@@ -84,7 +84,7 @@ def test_safe_mode_commands_flat_to_a_lost_mirror() -> None:
     assert state.mode is LoopMode.SAFE
 
 
-def test_before_its_first_report_a_mirror_gets_only_safe_commands_and_it_does_not_jump_at_the_first_command() -> None:
+def test_before_its_first_report_a_mirror_gets_commands_only_in_safe_mode_and_it_does_not_jump_at_the_first() -> None:
     shape = MirrorShape(0, np.full(GRID, 20, np.float32), np.zeros(0, np.float32))
     absent, timeout = MirrorReport(0, "has not reported yet"), Tick(0, DEFAULTS.frame_timeout_ns + 1)
     state, all_outputs = feed(DEFAULTS, loaded(DEFAULTS), absent, *frames(1, 2), timeout)

@@ -450,7 +450,7 @@ def test_an_automatic_gain_request_dated_by_the_cameras_clock_ends_no_reservatio
 def test_a_fault_of_the_mirror_and_another_fault_after_it_count_after_two_healths_in_a_row(
     calibration: Calibration, tmp_path: Path
 ) -> None:
-    """A reason that this version does not know is a fault, too. A mirror that has just recovered has no command yet."""
+    """A mirror that has just recovered is still without a command. An unknown reason is a fault, too."""
     listener, _, controller = lone_controller(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     report_shape(listener)
     assert controller._mirror.first() is not None

@@ -52,7 +52,7 @@ def bench(magnitude: float, preset: str = "bench", sensor: str = "sam", **change
 
 
 def modal_bench() -> ModalBench:
-    """A loop of modes with the noise of images, computed without images, for tests of requests."""
+    """A loop simulated in modes, without images but with their noise, for tests of requests."""
     config = configuration(2.0)
     return ModalBench(config, factory.frame_noise_nm2(config, calibration(2.0, "sam")))
 
@@ -186,7 +186,7 @@ def test_the_command_of_a_mode_with_automatic_gain_zero_relaxes_to_zero() -> Non
 
 
 def _contrast_relative_to_open_loop(magnitude: float, seed: int, frames: int) -> float:
-    """Contrast of the residual divided by that of the disturbance, second half of a run with a Zernike sensor."""
+    """Contrast of the residual / that of the reaction wheels, in the second half of a run with a Zernike sensor."""
     loop = bench(magnitude, "reaction-wheel", "zwfs", seed=seed)
     form = np.diag(factory.contrast_of(loop.config).form)
     loop.run(frames - frames // 2, record=False)
@@ -197,7 +197,7 @@ def _contrast_relative_to_open_loop(magnitude: float, seed: int, frames: int) ->
     return float(residual / disturbance)
 
 
-def test_closing_reduces_contrast_on_a_zernike_sensor_beyond_its_linear_range() -> None:
+def test_closing_reduces_the_added_contrast_on_a_zernike_sensor_beyond_its_linear_range() -> None:
     """The square of the residual tilt looks like focus, astigmatism and spherical aberration to a Zernike sensor."""
     assert _contrast_relative_to_open_loop(2.0, 1, 1250) < 1
 
@@ -228,7 +228,7 @@ def test_a_state_decoded_before_gains_are_measured_has_the_same_law() -> None:
 
 
 def test_tilt_cross_talk_uses_the_tilt_on_the_sensor_including_the_offset() -> None:
-    """The square of a tilt offset is in the image, but the loop's error excludes the offset."""
+    """The image has the cross-talk of the whole tilt, but the loop's error excludes the offset."""
     with patch.object(TiltCrossTalk, "add_frames", autospec=True, side_effect=TiltCrossTalk.add_frames) as added:
         loop = bench(2.0)
         loop.ask("offset", modes=(2,), values=(40.0,))
@@ -238,7 +238,7 @@ def test_tilt_cross_talk_uses_the_tilt_on_the_sensor_including_the_offset() -> N
 
 
 def test_added_contrast_is_measured_in_open_and_closed_loop() -> None:
-    # A bright star: at V = 2 the noise of a frame is some ten times the residual, and the estimate scatters fourfold.
+    # A bright star: at V = 2 the noise of a frame is some ten times the residual, so the estimate varies by 4.
     loop = bench(-1.0)
     form = np.diag(factory.contrast_of(loop.config).form)
 
@@ -274,7 +274,7 @@ def test_manual_gains_are_kept_and_harm_is_reported_before_and_after_closing() -
 
 
 def harmful_loop(on_harm: str) -> ModalBench:
-    """A closed loop that increases the residual; three windows end after 1000 frames."""
+    """A closed loop that increases the residual; harm is reported after its third window, at frame 1000."""
     config = configuration(6.5, **FIXED_GAINS | {"control.on_harm": on_harm})
     return ModalBench(config, factory.frame_noise_nm2(config, calibration(6.5, "sam")))
 
@@ -296,7 +296,7 @@ def test_the_integrator_takes_over_from_a_harmful_law_once_the_loop_is_not_reser
     loop.process_input(Request(loop.steps[-1].time_ns, "lease", (), (60.0,), "another client", lease_id=1))
     loop.run(1000)
     assert [event["action"] for event in details_of(loop, "LOOP_HARMS")] == ["the integrator takes over"]
-    assert loop.state.loop.law_runner is not None, "the request of the gain watch was refused"
+    assert loop.state.loop.law_runner is not None, "the lease lets no request of the gain watch pass"
     loop.ask("release", lease_id=1)
     loop.run(700)
     assert loop.state.loop.law_runner is None
@@ -325,7 +325,7 @@ def test_a_mode_can_have_a_manual_gain_and_return_to_automatic() -> None:
     assert loop.state.loop.automatic.all()
 
 
-def test_a_truncated_reconstructor_is_weighted_without_an_inverse_of_its_response() -> None:
+def test_a_truncated_reconstructor_with_a_singular_R_H_is_weighted() -> None:
     setup, R = settings(auto_gain=(True, True)), toy_calibration().reconstructor * np.array([[1], [1], [0]], np.float32)
     load = Load(0, replace(toy_calibration(), reconstructor=R), "test")
     request = Request(0, "gain", (), (0.0, 0.4, 0.1), "auto", prior_nm2=(4.0, 0.0, 0.0), flux_dn=FLUX_DN)

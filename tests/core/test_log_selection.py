@@ -228,5 +228,5 @@ def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -
     assert "1 in 10 frames" in estimate(fewer)
 
 
-def test_lowfc_record_start_is_refused_with_the_name_of_the_request() -> None:
+def test_the_error_of_lowfc_record_start_names_the_ctl_command() -> None:
     assert "`lowfc ctl record start`" in refusal("record", "start", kind=ConfigurationError)

@@ -50,7 +50,7 @@ def test_the_limiting_gain_is_accurate_to_one_percent(
 
 
 def test_a_kolmogorov_screen_is_corrected_up_to_the_controlled_modes() -> None:
-    """The screen has 0.05 waves rms, as in case (3) of the paper; more than a third of that is of higher orders."""
+    """The screen has 0.05 waves rms, as in case (3) of the paper, and more than a third of it in uncontrolled modes."""
     run = run_loop(configured(disturbance__preset="kolmogorov", control__gain=0.2, control__tilt_gain=0.3), 150)
     assert run.disturbance_rms_nm[-1] == pytest.approx(0.05 * 550, rel=1e-5)
     assert 0.35 < run.residual_rms_nm[-1] / run.disturbance_rms_nm[-1] < 0.6

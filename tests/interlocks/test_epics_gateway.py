@@ -227,7 +227,7 @@ def test_a_port_in_use_is_an_error_with_the_address(pvs: Variables) -> None:
 def test_the_command_serves_a_run_until_it_is_stopped(
     pvs: Variables, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The fake run restarts once; `safe` is answered while a log still ends; the first posted frame stops it."""
+    """The fake run restarts once; `safe` is answered while a log still ends; the first frame stops the command."""
     buses: list[MemoryBus] = []
     hub, bench, real_post, log_ended = MemoryHub(), list[Sample](), pvs.Shared.post, threading.Event()
     controller = MemoryBus(hub, "controller", HostClock())

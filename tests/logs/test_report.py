@@ -227,7 +227,7 @@ def test_the_verdict_names_what_was_wrong(eventful: dict[str, Any]) -> None:
 
 
 def uneventful(night: SyntheticLog, frames: int = 300) -> SyntheticLog:
-    """The log with frames without fault between two Healths of the camera."""
+    """Add frames without a fault between two Healths of the camera, and return the log."""
     return night.health("camera", state="ready").frames(frames).health("camera", state="stopped")
 
 

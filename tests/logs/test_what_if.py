@@ -1,4 +1,4 @@
-"""What-ifs of logs, compared with runs that had the same gains, their warnings, and errors in their options."""
+"""What-ifs of logs: comparison with runs that had the same gains, warnings, and errors in options."""
 
 import json
 import re
@@ -90,7 +90,7 @@ BENCH = {"disturbance__preset": "bench", "disturbance__scale": 0.7}
             for delay in (1, 1.4, 2, 3)
             for overrides in ({}, BENCH)
         ),
-        # Without noise, some modes have no error but the 0.1 nm with which tilt near 5 mas appears in them.
+        # Without noise, the only error of some modes is 0.1 nm of cross-talk from a tilt near 5 mas.
         *(
             pytest.param(2000, pair, 1, 0.1, {"camera__noise": False}, marks=pytest.mark.slow)
             for pair in ((HIGH_TILT_GAIN, LOW_TILT_GAIN), (LOW_TILT_GAIN, LEAKY))
@@ -116,7 +116,7 @@ def test_in_the_linear_range_a_what_if_agrees_with_a_run_with_the_same_gains(
 
 
 FRAMES = 1200
-SETTLING = 599  # frames left out at the start: half of the log, because settling would take longer
+SETTLING = 599  # frames left out at the start: the settling time, limited to half of the log
 OTHER = "gain=0.3,tilt_gain=0.2,leak=0.01"
 
 
@@ -186,7 +186,7 @@ class MidExposureLog(SyntheticLog):
 
 
 def test_with_a_fractional_delay_the_continuous_residual_includes_the_motion_of_the_mirror(tmp_path: Path) -> None:
-    """Expected: true disturbance plus commands, which move the mirror a quarter period after an exposure starts."""
+    """Expected: true disturbance plus commands, which move the mirror amid the exposure of half a period."""
     toml = load(None, {"sensor.modes": 10, "camera.delay_frames": 1.5}).to_toml()
     log = MidExposureLog(delay_frames=1.5, gain=(0.6, 0.6)).frames(FRAMES)
     run = LoggedRun(read_history(LogReader(log.write(tmp_path / "x.mcap", toml=toml))))
@@ -287,7 +287,7 @@ def test_another_reconstructor_measures_the_same_frames(runs: dict[str, LoggedRu
 def test_another_reconstructor_is_weighted_like_the_logged_one(
     runs: dict[str, LoggedRun], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Automatic gains left focus, of 4 nm rms, uncorrected: this prior weighted the logged reconstructor."""
+    """The logged reconstructor has a prior of 4 nm rms in focus, which automatic gains left uncorrected."""
     run = runs["default"]
     state = deepcopy(run.history.controllers[-1])
     state.prior_nm2[:], state.weighting_flux_dn = [0, 0, 16], toy.FLUX_DN
@@ -298,7 +298,7 @@ def test_another_reconstructor_is_weighted_like_the_logged_one(
     np.testing.assert_array_equal(run.measured_again(run.calibration), expected)
     for change, warned in (("estimator=pinv", True), ("gain=0.3", True), ("gain=0,tilt_gain=0.2", False)):
         warnings = " ".join(results_of(run, requested_changes(change))["warnings"])
-        assert ("a prior of the modes that automatic gains did not correct (focus)" in warnings) == warned
+        assert ("a prior for the modes that automatic gains did not correct (focus)" in warnings) == warned
 
 
 def test_used_frames_that_the_log_lacks_are_counted(
@@ -433,7 +433,7 @@ def test_a_command_from_before_the_log_is_not_reported_as_a_missing_command() ->
     np.testing.assert_array_equal(run.seen_nm, command_nm - 2)
 
 
-def test_a_probe_sequence_of_the_target_is_not_reported_as_a_missing_command() -> None:
+def test_a_probe_sequence_added_to_the_offset_is_not_reported_as_a_missing_command() -> None:
     """With 3 nm added to the target in 10 frames, the error is smaller by 3 nm; these frames are compared."""
     error_nm = np.full((40, 3), 4, np.float32)
     error_nm[20:30] -= 3
@@ -445,7 +445,7 @@ def test_a_probe_sequence_of_the_target_is_not_reported_as_a_missing_command() -
     assert rows_compared(run) == list(range(10, 40))
 
 
-def test_neither_a_frame_from_the_future_nor_an_earlier_camera_start_after_clear_shortens_the_run() -> None:
+def test_frames_after_a_frame_from_the_future_or_of_an_earlier_camera_start_after_clear_are_kept() -> None:
     sequence, reasons = history().steps.sequence, np.zeros(40, np.int64)
     sequence[10], reasons[10] = toy.frame_sequence(0, 2 * toy.START), 1 << Rejection.AHEAD
     sequence[30:] -= np.uint64(1 << 32)
@@ -585,11 +585,11 @@ def test_options_are_parsed() -> None:
         ("estimator=best", "estimator must be weighted or pinv, got 'best'"),
         *((text, "every .* must be between") for text in ("gain=5", "leak=2", "gain=nan")),
         ("limit_nm=-1", "every limit_nm must be finite and at least 0"),
-        *((f"limit_nm={text}", f"limit_nm must be between -1e.09 and 1e.09, got {text}") for text in ("inf", "-3e38")),
+        *((f"limit_nm={text}", f"at most 1e.09 in magnitude, got {text}") for text in ("inf", "3e38", "-3e38")),
     ],
 )
 def test_invalid_options_are_refused(text: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         what_if(LoggedRun(history()), requested_changes(text))
-    with pytest.raises(ConfigurationError, match="gain apply to the integrator"):
+    with pytest.raises(ConfigurationError, match="gain: only for the integrator"):
         requested_changes("gain=0.3", controller="mine.py:step")

@@ -48,12 +48,12 @@ def test_quadratic_form_underestimates_large_tilt(
 
 
 def test_spherical_adds_thousands_of_times_more_contrast_than_tilt(form: Array) -> None:
-    of_mode = np.diag(form)
-    assert 3000 < of_mode[NOLL.index(11)] / of_mode[0] < 6000
-    assert of_mode.argmax() == NOLL.index(11)
+    added_by_mode = np.diag(form)
+    assert 3000 < added_by_mode[NOLL.index(11)] / added_by_mode[0] < 6000
+    assert added_by_mode.argmax() == NOLL.index(11)
 
 
-def test_contrast_added_by_tilt_agrees_with_finer_sampled_images(coronagraph: Coronagraph, form: Array) -> None:
+def test_contrast_added_by_tilt_agrees_with_more_finely_sampled_images(coronagraph: Coronagraph, form: Array) -> None:
     axis = 2 * pupil_axis(len(coronagraph.pupil))
     tilt_nm = zernikes((2,), axis, axis[:, None])[0]
     flat, plus, minus = (mean_contrast(coronagraph, x * tilt_nm, WAVELENGTH_NM, DARK_ZONE, 16) for x in (0, 1, -1))

@@ -1,4 +1,4 @@
-"""The detector's noise against its probability distributions, its saturation, and the photometry of the paper."""
+"""The detector: noise compared with its probability distributions, and saturation; the photometry of the paper."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def test_noise_table_has_the_exact_distribution_at_its_levels(camera):
     numbers = np.arange(table.first_dn, table.first_dn + table.remainder.shape[1])
     for level in (0, 1, 2, 17, 64, 500, len(table.entries) - 1):
         entries = table.entries[level].astype(int)
-        from_remainder = (entries > numbers[-1]).sum()  # draws that the second distribution decides
+        from_remainder = (entries > numbers[-1]).sum()  # draws whose number `table.remainder` gives
         found = np.bincount(entries[entries <= numbers[-1]] - numbers[0], minlength=len(numbers)).astype(float)
         found += from_remainder * np.diff(table.remainder[level].astype(float), prepend=0.0)
         assert 0.5 * np.abs(found / len(entries) - probabilities(camera, level * STEP_E, numbers)).sum() < 1e-7

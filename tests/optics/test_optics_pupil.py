@@ -16,7 +16,7 @@ from lowfc.optics.chain.zernike import mode_name, noll_to_orders, zernike
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.9, 1.1])
-def test_relay_pupil_is_not_inverted_and_energy_is_conserved(scale):
+def test_relay_pupil_is_upright_and_energy_is_conserved(scale):
     u = pupil_axis(128)
     pupil = np.exp(-((u - 0.2) ** 2 + (u[:, None] + 0.1) ** 2) / 0.08**2).astype(complex)
     focal = to_image(pupil, 360, 8, scale)

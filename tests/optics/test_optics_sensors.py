@@ -272,7 +272,7 @@ def test_another_wavelength_is_equivalent_to_rescaled_optics(name):
     np.testing.assert_allclose(found, reference(scaled), rtol=1e-9, atol=1e-15)
 
 
-def test_the_papers_defocus_has_a_better_condition_number_than_a_third_or_twice_of_it(modes):
+def test_the_papers_defocus_has_a_better_condition_number_than_a_third_of_it_or_twice_it(modes):
     def condition(defocus_mm):
         optics = sensor_from(SensorSection(kind="clowfs", defocus_mm=defocus_mm))
         return np.linalg.cond(response(optics, modes[:14]))

@@ -111,7 +111,7 @@ def test_the_document_is_rendered_from_its_results(committed):
 def test_a_table_of_one_sensor_agrees_with_the_committed_one(few, committed, name):
     others = {each[0] for each in compare(few[name], committed[name])}
     own = {row["name"] for row in few[name]["rows"]} & {row["name"] for row in committed[name]["rows"]}
-    # Table 3's input rows are named after the first sensor computed with that pupil: in the complete table not SAM.
+    # Table 3's input rows are named after the pupil's first sensor, which is not SAM in the complete table.
     assert others == {row["name"] for row in few[name]["rows"] + committed[name]["rows"]} - own
     assert (SAM in own) == (name in ("table2", "table3", "table4"))
     assert ("zwfs" in own) == (name in ("conditioning", "photometry"))

@@ -68,7 +68,7 @@ def test_tilt_per_axis_counts_only_the_axes_among_the_modes() -> None:
     assert (found["tilt_disturbance_mas"], found["tilt_residual_mas"]) == pytest.approx((3.0, 1.5))
 
 
-def test_the_modes_that_add_most_contrast_are_named_even_without_a_disturbance_in_the_dark_zone() -> None:
+def test_the_modes_that_add_most_contrast_are_named_even_if_the_disturbance_adds_no_contrast() -> None:
     run = statistics()
     run.add(truth(1.0), 0.0, np.arange(3))
     assert [*run.wavefront().values()][-2:] == ["focus", pytest.approx(2 / 3)]

@@ -270,6 +270,7 @@ def test_a_view_to_a_file_is_not_restarted(benches: ViewBenches, monkeypatch: py
 def test_complete_snapshots_are_drawn_on_time_even_if_drawing_is_slow(
     monkeypatch: pytest.MonkeyPatch, pause_s: float, all_complete: bool
 ) -> None:
+    """A complete snapshot has all new data; another has only the newest frame, mirror state and surface."""
     complete: list[bool] = []
 
     def draw(snapshot: Snapshot) -> None:

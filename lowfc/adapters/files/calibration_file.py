@@ -69,7 +69,7 @@ def save(calibration: Calibration, path: Path) -> None:
 
 
 def load(path: Path, content: bytes | None = None) -> Calibration:
-    """Read a calibration from a FITS file, or from its `content` (`path` then serves only errors); check its identity.
+    """Read a calibration from a FITS file, or from its `content` (`path` is then for errors); check its identity.
 
     Raises:
         DataFileError: the file is missing or damaged, or is of another kind.

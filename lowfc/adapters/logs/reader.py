@@ -35,7 +35,7 @@ class LogReader:
         schemas: schemas declared so far, by id.
         channels: channels declared so far, by key and start of the publisher.
         damage: damaged stretches that were left out.
-        unreadable: number of messages left out because their declaration was damaged.
+        unreadable: number of messages left out because the record of their channel or schema was damaged.
         finished: whether the log has the end of a finished log; False during recording, or if its recorder died.
         complete: whether the end was reached with a valid summary; False while reading.
         progress: function called with the progress of reading, see `__init__`.
@@ -153,7 +153,7 @@ class LogReader:
             return []
         self._chunks.add(identity)
         if self.unreadable and not self._skip_damaged:
-            raise self._error(chunk.position, "the declaration of its messages is missing")
+            raise self._error(chunk.position, "the record of a channel or schema is missing")
         if messages:
             for damage in self.damage[self._dated_damage :]:
                 damage.before_ns = messages[0].receive_time_ns

@@ -41,7 +41,7 @@ FILE_MODE = 0o640
 """Default permissions of a log, further reduced by the umask: notes and frames are not public."""
 
 CHUNK_BYTES = 240 * 1024
-"""The message that exceeds this size ends the chunk; if it has up to 15 KiB, the chunk stays below 256 KiB."""
+"""The message with which a chunk exceeds this size ends it; with messages of up to 15 KiB, it stays below 256 KiB."""
 
 PART = "part"
 """Name of the metadata with the recording that a file belongs to, and the file's number in it."""

@@ -6,9 +6,9 @@ script is killed.
 
 Measured with rerun 0.41:
 
-- `RecordingStream.log` to a hanging viewer continues until about 100 MB are unsent (its process grows by 150 MB), then
-  blocks. With a dead viewer it neither blocks nor lets the process grow; a new stream with the same ids to a
-  new viewer on the same port continues the recording.
+- `RecordingStream.log` to a hanging viewer continues until about 100 MB are unsent (the calling process grows by 150
+  MB), then blocks. With a dead viewer the call does not block and the calling process does not grow; a new stream with
+  the same ids to a new viewer on the same port continues the recording.
 - `disconnect`, `del`, and the end of the process block while the viewer hangs: call stop() first.
 - A browser's page must be reloaded after its server has restarted.
 - The memory limit applies to the data as counted by rerun: the memory of a viewer levelled off at 184 MB for the limit

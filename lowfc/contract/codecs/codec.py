@@ -221,7 +221,7 @@ def max_bytes(name: str) -> int:
 
 
 def only_requester(payload: bytes) -> bytes:
-    """A request of at most 8000 bytes, reduced to its requester; empty if it is longer or cannot be read."""
+    """A request reduced to its requester, from its first 8000 bytes; empty if these cannot be read."""
     try:
         request = wire.Request.FromString(payload[:_BYTES_WITHOUT_ARRAYS])
         return wire.Request(requester=request.requester).SerializeToString()

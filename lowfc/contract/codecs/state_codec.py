@@ -89,7 +89,7 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
 
 
 def calibration_in_use(message: wire.ControllerState, calibration: Calibration) -> Calibration:
-    """The calibration with the reconstructor in use; automatic gains may have given it a prior of uncorrected modes."""
+    """The calibration with the reconstructor in use; automatic gains may have added a prior for uncorrected modes."""
     prior_nm2 = np.array(message.prior_nm2, np.float32)
     if message.calibration_id != calibration.id or prior_nm2.size != len(calibration.noll):
         return calibration

@@ -1,4 +1,4 @@
-"""Probe signals to measure a loop: multisines, whose lines (frequencies) each belong to one mode; staircases.
+"""Probe signals to measure a loop: multisines, each line (frequency) of which belongs to one mode, and staircases.
 
 All lines of a multisine are odd multiples of the inverse of its period, so that products of a second-order
 nonlinearity fall between them. No two lines are neighbours, so that Hann's window separates them.
@@ -78,7 +78,7 @@ def multisine(period_frames: int, bins: list[Integers], rms_nm: float, seed: int
 
 
 def with_lead_in(period: Single, lead_frames: int) -> Single:
-    """A period (frames, modes) after the `lead_frames` frames before it if it repeats: the loop settles in them."""
+    """A period (frames, modes) after its last `lead_frames` frames, repeated if need be, in which the loop settles."""
     return np.concatenate([period[np.arange(-lead_frames, 0) % len(period)], period])
 
 

@@ -60,7 +60,7 @@ def _fused(
             return None
         law, x = law_runner.law, law_runner.x
         matrices, from_error = (law.joined, law.output), law.signal == "error"
-    shift_nm = target_nm = tables.no_shift
+    shift_nm = target_nm = tables.zeros_nm
     channels_nm = tables.no_channels
     if channels is not None:
         shift_nm = seen_nm(loop.delay_weights, channels.shifts_nm)
@@ -128,7 +128,7 @@ def _update_guard(
 def next_command(
     settings: Settings, state: State, loop: ActiveLoop, error_nm: Single, sequence: int
 ) -> tuple[ActiveLoop, tuple[Reason, ...], bool]:
-    """The loop with the command for an error (modes,), the limits that acted, and whether it still returns to zero."""
+    """The loop with the command for an error (modes,), the limits that acted, and the next `returning_to_zero`."""
     if state.mode is LoopMode.SAFE:
         return step_to_flat(settings, loop), (), False
     channels, returning_to_zero = loop.command_channels, state.returning_to_zero

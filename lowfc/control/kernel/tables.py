@@ -51,7 +51,8 @@ class Tables(NamedTuple):
         full_well: lowest count of a saturated pixel; above all counts if no pixel can be saturated.
         margin_dn: `DARK_MARGIN` in DN.
         shapes: (modes, actuators) nm of surface per nm of wavefront.
-        no_shift: (modes,) zeros for `respond` without channels or offset; `no_channels` (rows, columns) likewise.
+        zeros_nm: (modes,) shift and target for `respond` without channels or offset.
+        no_channels: (rows, columns) zeros, likewise.
         no_states: (0,), for `respond` without a linear law; `no_law` (0, 0) likewise.
     """
 
@@ -68,7 +69,7 @@ class Tables(NamedTuple):
     dark_sum_dn: float
     margin_dn: float
     shapes: Single
-    no_shift: Single
+    zeros_nm: Single
     no_states: Single
     no_law: Single
     no_channels: Single
@@ -97,7 +98,7 @@ class Tables(NamedTuple):
             dark_sum_dn=float(calibration.dark.astype(np.float64) @ calibration.good),
             margin_dn=DARK_MARGIN * calibration.flux_dn,
             shapes=single(calibration.modes_to_actuators.T),
-            no_shift=np.zeros(modes, np.float32),
+            zeros_nm=np.zeros(modes, np.float32),
             no_states=np.zeros(0, np.float32),
             no_law=np.zeros((0, 0), np.float32),
             no_channels=np.zeros(calibration.grid, np.float32),

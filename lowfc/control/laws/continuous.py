@@ -168,8 +168,8 @@ def held_residual_nm2(
     ahead_nm, response = means_while_applied(measured_nm, timing)
     rows = np.isfinite(ahead_nm).all(axis=1)
     command = commanded(law, np.maximum(_FILTER_OMEGA, 1e-6), timing.delay)
-    noise_gain = np.abs(response)[:, None] ** 2 + 2 * np.real(response[:, None] * command.conj())
-    by_noise_nm2 = noise_nm2 * np.trapezoid(noise_gain, _FILTER_OMEGA, axis=0) / np.pi
+    power_gain = np.abs(response)[:, None] ** 2 + 2 * np.real(response[:, None] * command.conj())
+    by_noise_nm2 = noise_nm2 * np.trapezoid(power_gain, _FILTER_OMEGA, axis=0) / np.pi
     squares = np.sum((ahead_nm[rows] + command_nm[rows]) ** 2, axis=0)
     return squares - rows.sum() * by_noise_nm2, int(rows.sum())
 

@@ -112,8 +112,8 @@ def spectrum(series: TimeSeries, rate_hz: float, frames: int = 0) -> Spectrum | 
     """Welch's estimate over all pieces of at least a segment's length; None if there are none.
 
     Each segment's mean is subtracted, and Hann's window applied. A segment has `frames` frames or, if this is 0, a
-    power of two that follows from the longest piece. The result is that of `scipy.signal.welch`, whose
-    import takes half a second.
+    power of two that follows from the longest piece. Of a single piece, the result is that of `scipy.signal.welch`,
+    whose import takes half a second.
     """
     if series.longest < SHORTEST:
         return None

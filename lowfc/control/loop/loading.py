@@ -89,7 +89,7 @@ def safe_pending(settings: Settings, state: State) -> bool:
 def misfit_cause(state: State) -> str:
     """Why the camera's last received settings do not fit the calibration; empty if they do.
 
-    A calibration that has no settings yet fits any settings with its shape and saturation.
+    A calibration without camera settings fits any camera settings with its shape and saturation.
     """
     camera, loop = state.conditions.camera, state.loop
     if camera is None or loop is None or not loop.calibration.noll:
@@ -102,7 +102,7 @@ def misfit_cause(state: State) -> str:
 def uncalibrated_cause(state: State) -> str:
     """Why no mode can be measured: no calibration, or one computed for another frame size; empty otherwise."""
     loop, camera = state.loop, state.conditions.camera
-    hint = ": `lowfc commission` measures one"
+    hint = ": measure a calibration with `lowfc commission`"
     if loop is None or not loop.calibration.noll:
         return f"no calibration is loaded{hint}"
     rows, columns = loop.calibration.shape
@@ -137,7 +137,7 @@ def interlock_or_permit_cause(state: State) -> str:
 
 
 def bench_reported(settings: Settings, state: State, report: BenchReport) -> tuple[State, Outputs]:
-    """Evaluate the interlocks on a bench value; one that begins to act makes the loop safer, and none closes the loop.
+    """Evaluate the interlocks on a bench value; an interlock may open the loop, but none closes it.
 
     Before the first used frame, `refuse_close` also opens a loop that started closed. While the gains are measured,
     `open` and `refuse_close` keep the loop from closing by itself afterwards.
@@ -250,7 +250,7 @@ def end_probe(loop: ActiveLoop, sequence: int, why: str, events: list[PendingEve
 
 
 def camera_reported(settings: Settings, state: State, camera: CameraSettings) -> tuple[State, Outputs]:
-    """Store the camera's settings; open a closed loop if they do not fit; enter or leave idle: `uncalibrated_cause`."""
+    """Store the camera's settings; open a closed loop if they do not fit. Idle while `uncalibrated_cause` has one."""
     after = _with_camera(state, camera)
     if after is state:
         return state, Outputs()
@@ -281,7 +281,7 @@ def _with_camera(state: State, camera: CameraSettings) -> State:
 
 
 def adopted(loop: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[PendingEvent]]:
-    """Make a shape's deviation (rows, columns) from the modal command a channel, unless it is only rounding."""
+    """Adopt as a channel what the modal command does not explain of a shape (rows, columns), unless only rounding."""
     deviation_nm = shape_nm.copy()
     deviation_nm -= (loop.to_actuators @ loop.history_nm[0]).reshape(deviation_nm.shape)
     if not np.abs(deviation_nm).max() > ADOPTED_NM:
@@ -296,7 +296,7 @@ def adopted(loop: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[Pendin
 
 
 def in_mode(state: State, mode: LoopMode, time_ns: int, cause: str) -> State:
-    """Change the loop mode; probe sequence, steps and return to zero of the previous mode end.
+    """Change the loop mode; a probe sequence, a `step` request and a return to zero end.
 
     Safe mode removes the channels except the flat map and `EXTERNAL`; a law fades in when the loop closes.
     """

@@ -16,7 +16,7 @@ from lowfc.arrays import Single
 from lowfc.control.loop.wording import mode_word
 
 MAX_LIMIT_NM = 1e9
-"""Largest modal limit and largest actuator of a channel, nm; a much larger number squared overflows in float32."""
+"""Largest modal limit and actuator value of a channel, nm; a much larger number squared overflows in float32."""
 MARGIN_NM = 1e-3
 """Least distance kept from stroke and slew limit, and half of it from the neighbour limit, so that float32 rounding
 (6e-5 nm at 750 nm) cannot cross them."""
@@ -59,7 +59,7 @@ NOT_NEW = frozenset((Rejection.OUT_OF_ORDER, Rejection.REPEATED, Rejection.AHEAD
 
 
 class Limit(IntEnum):
-    """Why a command was changed or refused, or that the guard overrules the law; numbered as on the wire."""
+    """Why a command was changed or refused; the last: the guard overrules the law. Numbered as on the wire."""
 
     MODAL_LIMIT = 20
     STROKE = 21
@@ -165,10 +165,12 @@ def limit(limits: Limits, previous_nm: Single, requested_nm: Single) -> Limited:
 
 
 def _shorten(limits: Limits, previous_nm: Single, kept_nm: Single) -> Single:
-    """Go from `previous_nm` towards `kept_nm` as far as neighbours allow, or only shrink it if it is at a limit.
+    """Move from `previous_nm` towards `kept_nm` as far as the neighbour limit allows.
 
-    The result is half a margin further below the neighbour limit than `limit` requires: rounding could block a mirror
-    that is exactly at it.
+    If `previous_nm` is itself at the neighbour limit or beyond the stroke limit, it is only scaled down.
+
+    The result is half a margin further below the neighbour limit than `limit` requires: otherwise a mirror
+    exactly at it, by rounding, could no longer move.
     """
     margin_nm = limits.margin_nm
     neighbour_nm = limits.neighbour_nm - margin_nm
@@ -226,7 +228,7 @@ def request_mode(mode: LoopMode, request: str, calibrated: bool) -> tuple[LoopMo
         case "clear":
             return mode, f"the loop is {mode.in_words}, not in safe mode: there is nothing to clear"
         case "open" | "close" if mode is LoopMode.SAFE:
-            return mode, "the loop is in safe mode: `lowfc ctl clear` first, when it is safe"
+            return mode, "the loop is in safe mode: `lowfc ctl clear` first, when the mirror may move"
         case "open" if not calibrated:
             return LoopMode.IDLE, ""
         case "close" if not calibrated:

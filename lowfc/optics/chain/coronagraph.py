@@ -152,7 +152,7 @@ def contrast_curve(coronagraph: Coronagraph, opd_nm: Array, wavelength_nm: float
     """Contrast (rings,) averaged in azimuth within the opening of `DARK_ZONE`, Fig. 1(c); arguments as for `contrast`.
 
     `edges` (rings + 1,) are the radii of the rings' edges, in lambda / D. The first radius and the spacing must be at
-    least the distance of two samples; a ring without a sample is NaN.
+    least the spacing of samples, 1 / `SAMPLES_PER`; a ring without a sample is NaN.
     """
     sector = Wedge(0.0, float(edges[-1]), DARK_ZONE.half_opening_deg)
     columns, rows = _extent(sector, SAMPLES_PER)

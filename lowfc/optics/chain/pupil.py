@@ -58,7 +58,7 @@ def prolate(samples: int, mask_radius: float) -> Array:
 
 
 def _mask_kernel(r: Array, rho: Array, radius: float) -> Array:
-    """Kernel (r, rho) pupil to mask to pupil: integral of x J0(2 pi r x) J0(2 pi rho x) over x from 0 to `radius`."""
+    """Kernel (r, rho) from pupil via mask to pupil: integral of x J0(2 pi r x) J0(2 pi rho x), x from 0 to `radius`."""
     from scipy.special import j0, j1  # its import takes a quarter of a second; most processes load a stored result
 
     a, b = 2.0 * np.pi * r[:, None], 2.0 * np.pi * rho[None, :]

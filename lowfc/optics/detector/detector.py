@@ -68,8 +68,8 @@ def expose(detector: Detector, electrons: NDArray[np.floating], rng: np.random.G
     If `noise_table_of` returns a table, pixels with a mean below `FAINT_E` electrons are drawn from it. Their
     distribution is exact at means that are multiples of 1/64 electron. Between these the mean is exact and the
     variance too large by at most 6e-5 electrons squared. With a read noise of half an electron or more, a chi-square
-    test of a million draws does not detect this. With a lower read noise, two electrons are too frequent in a pixel
-    with a mean near 0.005.
+    test of a million draws does not detect this. With a lower read noise, pixels with a mean near
+    0.005 electrons have two electrons too often.
 
     Args:
         detector: The detector.

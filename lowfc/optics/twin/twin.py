@@ -1,6 +1,6 @@
 """The digital twin: the optics compressed to a few small matrices, and their evaluation.
 
-At each wavelength the field at the sensor is linear in exp(i phi) at the pupil nodes, and both ends are band-limited:
+At each wavelength the field at the sensor is linear in exp(i phi) at the pupil nodes, and both are band-limited:
 
     exp(i phi) --to_modes--> modes --to_coefficients--> coefficients of prolate functions --basis--> field at points
 
@@ -19,15 +19,16 @@ from lowfc.arrays import Array, Complex, Integers, Single
 
 @dataclass(frozen=True)
 class TwinSpec:
-    """Degree of compression. By default, the rms error of the named sensors' images is below 1e-4 of the image's rms.
+    """Degree of compression. By default, images of the named sensors have an rms error below 1e-4 of the image's rms.
 
     For other combinations of pupil, focal-plane mask and relay, rms errors of up to 2e-3 were found.
 
     Attributes:
         nodes: Pupil nodes across the diameter.
         order: Number of nodes from which a point is interpolated along an axis; even.
-        rank: Retained modes of the operator for a focal-plane mask with the area of a disk of radius 4 lambda0 / D and
-            an aperture mask. `build` increases it for a larger mask, for a bright pupil, and without an aperture mask.
+        rank: Retained singular modes of the operator, for an aperture mask and a focal-plane mask with the area of a
+            disk of radius 4 lambda0 / D. `build` scales it with the mask's area, and increases it for a pupil
+            whose mean transmission is above 0.5, and without an aperture mask.
         guards: Prolate functions along each axis beyond the product of the field's bandwidth and the sensor's width.
     """
 
@@ -48,9 +49,9 @@ class Operator:
     Attributes:
         wavelength_nm: The wavelength.
         weight: Weight of this wavelength in the image of the band.
-        modes: (rows, rank) orthonormal modes, in the rows of `field_operator`.
-        to_modes: (rank, used) real matrix from exp(i phi) at the used nodes to amplitudes of the modes. It includes the
-            units of the image.
+        modes: (rows, rank) the first singular vectors, orthonormal, of the matrix that `field_operator` returns.
+        to_modes: (rank, used) real matrix from exp(i phi) at the used nodes to amplitudes of the modes. It is
+            scaled so that |E|^2 has the units of the image.
         to_coefficients: (functions squared, rank) matrix from amplitudes of the modes to coefficients of products of
             the functions; real with an aperture mask, else complex.
         basis: (points, functions) complex: prolate functions at the points, each times its phase, a power of i.
@@ -70,7 +71,7 @@ class Twin:
 
     Attributes:
         spec: Degree of compression.
-        axis: Coordinates of the nodes along one axis, with guards, in pupil diameters.
+        axis: Coordinates of the nodes along one axis, in pupil diameters; order / 2 nodes on each side are outside.
         used: Flat indices of the used nodes in the square grid of the axis (rows = y, columns = x).
         area_weights: (used,) weights of sum 1 for means over the open pupil, whose samples (transmission above 0.5)
             count equally.

@@ -33,8 +33,8 @@ def build(
         progress: Called with the number of steps done and the total.
 
     Raises:
-        ValueError: The focal-plane mask is not symmetric, or complex with an aperture mask; or the rank of
-            `spec` exceeds that of the optics.
+        ValueError: The focal-plane mask is not symmetric, or complex with an aperture mask; or `spec` has an
+            odd order, a rank below 1, or a rank or number of functions that the optics do not have.
     """
     mask = sensor.focal_mask
     if mask.shape[0] % 2 or not (np.array_equal(mask, mask[::-1]) and np.array_equal(mask, mask[:, ::-1])):
@@ -85,7 +85,7 @@ def build(
 
 
 def _adjoint(to_samples: Array, weights: Mask) -> Array:
-    """Transfer weights from the pupil's samples to the nodes: sums of interpolated values are sums of node values."""
+    """Weights of the nodes for which their weighted sum is that of the values interpolated at the pupil's samples."""
     return np.asarray(to_samples.T @ weights.astype(np.float64) @ to_samples)
 
 

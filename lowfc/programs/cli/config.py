@@ -118,7 +118,7 @@ def config_zenoh(
     run: AnyRun = None,
     make: Annotated[
         bool,
-        typer.Option("--make", help=f"Create the run if it does not exist; its name without --run: {DEFAULT_RUN}."),
+        typer.Option("--make", help=f"Create the run if it does not exist (without --run: {DEFAULT_RUN})."),
     ] = False,
 ) -> None:
     """Print the zenoh configuration with which your own program joins a run in a role.

@@ -52,14 +52,14 @@ def contrast_cases(added: Mapping[str, float]) -> dict[str, float | None]:
 
 
 def contrast_in_words(
-    added: Mapping[str, float | None], largest: tuple[str, float] | None, beyond: Sequence[str] = (), method: str = ""
+    added: Mapping[str, float | None], costliest: tuple[str, float] | None, beyond: Sequence[str] = (), method: str = ""
 ) -> str:
-    """Text of the added contrast of each case, of the `largest` contribution to the last case, and of the method.
+    """Text of each case's added contrast, of the costliest modes of the last case and their share, and of the method.
 
     A caveat names the cases in `beyond`, for which full images differ from the quadratic form.
     """
     cases = ", ".join(f"{name} {value:+.1e}" for name, value in added.items() if value is not None)
-    share = "" if largest is None else f"; {largest[0]} contributes most ({100 * largest[1]:.0f} %)"
+    share = "" if costliest is None else f"; {costliest[0]} contributes most ({100 * costliest[1]:.0f} %)"
     caveat = f"; full images differ from the quadratic form by more than 10 %: {', '.join(beyond)}" if beyond else ""
     return f"added to the dark zone's contrast: {cases}{share}{method}{caveat}"
 

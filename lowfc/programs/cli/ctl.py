@@ -55,7 +55,7 @@ def frame_count(word: str) -> int:
 
 
 def bench_value(word: str) -> bool | float | str:
-    """Parse a bench value: `true` or `false` in upper or lower case, a number, or else a text."""
+    """Parse a bench value: true or false (upper or lower case), a number, or else a text."""
     if word.lower() in ("true", "false"):
         return word.lower() == "true"
     try:

@@ -23,7 +23,7 @@ NO_HEALTH = wire.Health()
 def json_object(
     state: wire.ControllerState, processes: Mapping[str, wire.Health] = MappingProxyType({}), run: str = ""
 ) -> dict[str, Any]:
-    """The state as `lowfc ctl status --json` prints it; lists by mode are in the calibration's order."""
+    """The state as `lowfc ctl status --json` prints it; modes are in the calibration's order, nm rms of wavefront."""
     playing = None
     if state.HasField("play"):
         play = state.play
@@ -239,7 +239,7 @@ def _summary_line(status: dict[str, Any]) -> str:
 
 
 def _last_warning(state: wire.ControllerState, processes: Mapping[str, wire.Health]) -> dict[str, Any] | None:
-    """The newest warning; if a mirror's driver failed, the mirror's newest one, as the failure causes the others."""
+    """The newest warning; if a mirror's driver failed, that mirror's newest one, as the failure causes the others."""
     warnings = [
         (from_timestamp(one.last_warning_timestamp), name) for name, one in processes.items() if one.last_warning
     ]

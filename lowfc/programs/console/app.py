@@ -152,9 +152,9 @@ class Console(OrderedKeys):
         else:
             self._do(action, {})
 
-    def action_choose(self, by: int) -> None:
+    def action_choose(self, lines: int) -> None:
         """Choose the next (1) or the previous (-1) knob."""
-        self.query_one(Gains).choose(by)
+        self.query_one(Gains).choose(lines)
 
     def action_turn(self, steps: int) -> None:
         """Turn the chosen knob by a number of steps."""
@@ -213,7 +213,7 @@ class Console(OrderedKeys):
         self._requesting[action.name].start()
 
     def _answered(self, action: Action, form: Form | None, text: str, *, ok: bool) -> None:
-        """Show the answer to an action, or why it failed. A form shows a failure, too, and closes otherwise."""
+        """Show the answer to an action, or why it failed. An open form shows a failure, and closes after success."""
         if self._torn_down:
             return
         self._show_answer(text, ok=ok)

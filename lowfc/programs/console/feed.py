@@ -119,7 +119,7 @@ class Feed(Monitor):
         return super()._complete(snapshot) and self._config is not None
 
     def _query(self) -> None:
-        """Query in a thread, because a frozen process delays the answer.
+        """Query in a thread, because a suspended process delays the answer.
 
         The configuration is queried once for each start of the controller, because each query is a request in the log.
         """

@@ -48,9 +48,9 @@ class Gains(Lines):
             self._chosen = min(self._chosen, max(0, len(knobs(noll)) - 1))
         self._draw()
 
-    def choose(self, lines_down: int) -> None:
-        """Choose the knob `lines_down` lines below the present one; the first one follows the last."""
-        self._chosen = (self._chosen + lines_down) % max(1, len(knobs(self._noll)))
+    def choose(self, lines: int) -> None:
+        """Choose the knob this number of lines below the present one; the first one follows the last."""
+        self._chosen = (self._chosen + lines) % max(1, len(knobs(self._noll)))
         self._draw()
 
     def turn(self, steps: int) -> None:

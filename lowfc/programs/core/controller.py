@@ -118,7 +118,7 @@ class Controller:
         service.awaited = lambda: "" if self._state.frame_sequence else "a camera"
 
     def run(self) -> None:
-        """Do all work but steps, which the receiving thread makes once the mirror is known; `_lock` serialises both."""
+        """Do all work but the steps after the first, which the receiving thread makes; `_lock` separates them."""
         self._service.state = "ready"  # from here on the service manager expects a watchdog signal, which `beat` sends
         self._camera.await_first()
         self._adopt_mirror()
@@ -350,7 +350,9 @@ class Controller:
             if reply.accepted:
                 continue
             law = request.name == "law"
-            unfit = law and (misfit_cause(self._state) or uncalibrated_cause(self._state))  # stays open or idle
+            unfit = law and (
+                misfit_cause(self._state) or uncalibrated_cause(self._state)
+            )  # the loop stays open or idle
             # Once the controller runs, clients may have changed the loop, so that a refusal is no fault of the file.
             if unfit or (self._mirror_adopted and request.text != ADOPTED):
                 self._service.event("LAW_NOT_IN_FORCE" if law else "FLAT_NOT_IN_FORCE", why=reply.text)

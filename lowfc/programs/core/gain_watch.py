@@ -204,7 +204,7 @@ class GainWatch:
         return ratio
 
     def _star_changed(self, step: Step, loop: ActiveLoop, ratio: float) -> Actions:
-        """Halve the automatic gains until measured again; if the flux fell below half, multiply them by its ratio."""
+        """Multiply automatic gains by 0.5, or by the flux ratio if that is smaller, until they are measured again."""
         for group in self._groups:
             group.bank.restart()
         events = (PendingEvent("STAR_CHANGED", {"ratio": ratio}),)

@@ -60,8 +60,8 @@ class MirrorReports:
         """Fault of the mirror, as a predicate after "the mirror"; empty if there is none.
 
         A fault counts after two Healths in a row with faults, even different ones: the first Health may predate the
-        last command. Another fault replaces it after two Healths in a row with that fault: a mirror that has just
-        recovered is still without a command.
+        last command. Another fault replaces it only after two Healths in a row with that fault, because a mirror that
+        has just recovered reports for a moment that it has no command.
         """
         now_ns = self._service.clock.host_ns()
         self._due_ns = now_ns + CHECK_PERIOD_NS

@@ -1,7 +1,7 @@
 """Process variables of a gateway, independent of its protocol: readings, and writable variables that send requests.
 
-A request is offered if it does not only read, has a `lowfc ctl` command, and needs no value, only numbers, or one text.
-It applies to all modes.
+Every request but `status` and `configuration` is offered if it has a `lowfc ctl` command, and needs no value, only
+numbers, or one text. It applies to all modes.
 """
 
 from collections.abc import Callable, Iterator

@@ -139,7 +139,7 @@ class _MessageCounts:
         if not topic.queryable and (self._begin_ns is None or now_ns < self._begin_ns):
             self._begin_ns = now_ns  # states and calibration, queried at the log's start, may be hours old
         self._losses.enter(topic, message, recorded=True)
-        publisher = ""  # the process of an event: several processes publish this key
+        publisher = ""  # set for events: several processes publish their key
         with contextlib.suppress(BadMessageError, DecodeError):  # a log holds unreadable messages, too
             if topic is HEALTH:
                 self._losses.reconcile(message, wire.Health.FromString(message.payload))

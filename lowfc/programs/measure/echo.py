@@ -143,7 +143,7 @@ def _answer(config: Configuration, run: Run, command: bytes) -> None:
 
 
 def _join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Run:
-    """Set this process up like the loop's process of this role; return the run with the links of both only."""
+    """Set this process up like the loop's process of this role; return the run with the links of the two roles only."""
     prepare(config, role, cpus)
     run = open_run(run_id, (config.mirror.name,))
     ports = {str(role): run.links.ports[role] for role in (Role.CAMERA, Role.CONTROLLER)}

@@ -39,10 +39,10 @@ def validate(
     sensor: Annotated[
         list[str] | None,
         typer.Option(
-            help=f"Only this sensor, in all tables and figures but {' and '.join(WITH_FIXED_SENSORS)} (conditioning "
-            "keeps its open circle, bars and holes): sam, bowtie, bowtie:LAYOUT, clowfs, clowfs:MM (defocus in mm), "
-            "clowfs_tuned, zwfs, zwfs_tuned, bar, open, lyot, aplc; or a layout, FILE.json or FILE.json:NAME. May be "
-            "repeated.",
+            help=f"Only this sensor, in all tables and figures but {' and '.join(WITH_FIXED_SENSORS)} (the table "
+            "conditioning keeps its open relay pupil, bars and holes): sam, bowtie, bowtie:LAYOUT, clowfs, "
+            "clowfs:MM (defocus in mm), clowfs_tuned, zwfs, zwfs_tuned, bar, open, lyot, aplc; or a layout, FILE.json "
+            "or FILE.json:NAME. May be repeated.",
             show_default=False,
         ),
     ] = None,
@@ -58,7 +58,7 @@ def validate(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Reproduce the paper's tables and figures: the paper's values, ours, their limits and the assumptions.
+    """Reproduce the paper's tables and figures: the paper's values, ours, theoretical limits and the assumptions.
 
     Example: lowfc validate table3 table4 --trials 20
     """

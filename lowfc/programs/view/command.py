@@ -47,7 +47,9 @@ def view(
     if foxglove:
         other_options = logs, native, web, save, headless_screenshot, seconds, config, as_json, web_port
         if any(other_options) or tab != Tab.OPERATOR or memory_mb != _MEMORY_MB:
-            raise ConfigurationError("--foxglove serves a running loop until Ctrl-C; use it only with --run and --port")
+            raise ConfigurationError(
+                "--foxglove serves a running loop until Ctrl-C; of the other options, it takes only --run and --port"
+            )
         from lowfc.adapters.process.clock import HostClock
         from lowfc.programs.view.foxglove_bridge import DEFAULT_PORT, serve_foxglove
 

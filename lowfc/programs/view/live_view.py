@@ -48,7 +48,7 @@ _RECORDER_S = 3.0  # time without the recorder's Health after which the recorder
 _FILE_S = 60.0  # longest time for the last data to be written to a file
 _POLL_S = 0.1
 _CHECK_S = 1.0  # time between two checks of viewer, render thread and memory
-_FROZEN_S = 3.0  # a longer time between two checks means that this process was suspended meanwhile
+_SUSPENDED_S = 3.0  # a longer time between two checks means that this process was suspended meanwhile
 _MAX_RENEWALS = 5  # restarts allowed within `_RENEWALS_S`; a further one ends the view
 _RENEWALS_S = 60.0
 
@@ -97,7 +97,7 @@ class LiveView:
                 time.sleep(_POLL_S)
                 now_s = time.monotonic()
                 if now_s - checked_s >= _CHECK_S:
-                    if now_s - checked_s > _FROZEN_S:
+                    if now_s - checked_s > _SUSPENDED_S:
                         self._resumed_s = now_s  # the render thread could not draw while this process was suspended
                     checked_s = now_s
                     self._check(now_s)

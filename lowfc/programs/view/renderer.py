@@ -85,7 +85,7 @@ class Renderer:
 
 
 class RenderThread(threading.Thread):
-    """Draws pictures thirty times a second and curves four times, until it is abandoned or fails.
+    """Draws pictures thirty times a second and curves about four times, until it is abandoned or fails.
 
     Attributes:
         drawn_s: end of the last drawing, by time.monotonic().

@@ -117,7 +117,7 @@ class Snapshot:
         frame, mirror, surface: newest frame (DN, at `frame_ns`), mirror state, and surface over the pupil (nm); None if
             none has arrived since the last snapshot or, in a `complete` one, since the last complete one. If there is a
             controller, `frame_ns` is at most `time_ns`, because the camera's clock may be ahead.
-        calibration, camera, controller: the latest state of each; None before the first. health: the latest by process.
+        calibration, camera, controller: the latest of each; None before the first. health: the latest by process.
         complete: whether all new data are included. An incomplete snapshot has only the newest frame, mirror state and
             surface; rows and events wait for a complete one.
         behind_s: longest time for which the messages of this snapshot may have waited.

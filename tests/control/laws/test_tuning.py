@@ -118,7 +118,7 @@ def test_a_log_with_too_few_frames_in_a_row_is_refused() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("delay", [1.0, 2.0])
 def test_a_law_tuned_in_a_loop_is_nearly_optimal_and_so_is_a_new_one_after_lines_have_moved(delay: float) -> None:
-    """The first law leaves below 1.15 times theory and the best LQG law; the new law below 1.15 times the first."""
+    """Limits: 1.15 times theory and the best LQG law for the first law, 1.15 times the first for the new law."""
     config = configured(delay_frames=delay)
     calibration = calibrated(config)
     bench = Bench(config, calibration)

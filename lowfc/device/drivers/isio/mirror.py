@@ -81,7 +81,11 @@ class IsioMirror:
         return self._beside[1]
 
     def apply(self, actuators_nm: Single) -> Single | None:
-        """Write the channel (rows, columns); return its part of a sum updated in time if this differs, else None."""
+        """Write the channel (rows, columns), nm of surface.
+
+        If the sum of the channels follows within `SUM_WAIT_S` and this channel's part of it is not the command, that
+        part is returned; else None.
+        """
         self._reopen()
         self._check_writer()
         total = self._current_total()

@@ -105,7 +105,7 @@ class Live:
         """Play a table and return the loop's response; without shapes (`basis`) the table is added to the offset.
 
         A table without columns adds no probe: only the steps are recorded. AcceptanceError if the table is too large
-        for a request, gains or law changed, or the mirror or the camera interrupted all `ATTEMPTS` attempts.
+        for a request, gains or law changed, or the mirror or the camera interrupted each of `ATTEMPTS` attempts.
         """
         self.check_length(frames := len(table), table.shape[1], basis)
         self.set_mode(mode)

@@ -182,7 +182,7 @@ def selected_modes(requested: Sequence[int], noll: Sequence[int]) -> tuple[int, 
 
 
 def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
-    """The loop's responses to a test in a log; DataFileError if there are none or a request disturbed the test."""
+    """The loop's responses to a test in a log; DataFileError if one is missing, incomplete or disturbed."""
     path, calibration = history.log.path, history.calibration
     announced = _announced(history.requests, kind)
     if calibration is None or not announced:

@@ -1,1 +1,1 @@
-"""`lowfc calibrate`: measure I0, H and R on a running loop, or compute them from its optical model."""
+"""`lowfc calibrate`: measure I0 and H on a running loop and compute R, or compute all three from its optical model."""

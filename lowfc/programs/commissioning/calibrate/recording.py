@@ -69,7 +69,7 @@ class Recording(NamedTuple):
     command_nm: Array
 
     def played(self, table: Array, delay_frames: float) -> Array:
-        """The rows of the table that the exposures saw (frames, columns)."""
+        """The table as seen by each exposure (frames, columns)."""
         return seen_rows(table, _weights(delay_frames), self.steps, self.commanded)[self._steps_of_frames]
 
     def commands(self, delay_frames: float) -> Array:
@@ -190,7 +190,7 @@ def _streams(loop: Client) -> Iterator[tuple[Iterator[Frame], Iterator[Step]]]:
 
 
 def _checked_mode(loop: Client, step: Step, previous: LoopMode | None, *, ended: bool) -> LoopMode:
-    """The mode of a step; raise if the probe sequence was stopped. `ended`: all rows precede this step."""
+    """The mode of a step; raise if the probe sequence was stopped, unless it has `ended`: all rows precede the step."""
     if not ended and previous is not None and step.mode is not previous:
         loop.check_lease()  # its error names who ended the lease
         raise CalibrationError(

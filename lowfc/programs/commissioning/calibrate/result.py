@@ -24,8 +24,8 @@ from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, cyc
 from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator
 
 MAX_NOISE_RATIO = 1.5
-"""Largest accepted ratio of the noise of the measured R to that of the computed R, at the same flux. A wavefront far
-from the zero point exceeds it."""
+"""Largest accepted ratio of the noise of the measured R to that of the computed R, at the same flux. It is exceeded
+if the sensor is misaligned, or the wavefront far from the zero point."""
 _MAX_MODEL_ERROR = 0.5  # largest error of an element of R H if the model is of this sensor and orientation
 DELAY_TOLERANCE_FRAMES = 0.1
 """Largest difference between measured and configured delay without a warning, frames."""

@@ -1,4 +1,4 @@
-"""The provisional calibration: from the image of one poke and the computed response, or from pokes of all modes."""
+"""The provisional calibration: from reference image, one or two pokes and computed response, or pokes of all modes."""
 
 from dataclasses import replace
 from typing import Any
@@ -39,7 +39,7 @@ MAX_MISFIT = 0.35
 one, relative to the standard deviation of the image."""
 CYCLES = 12  # cycles of pokes that measure the response without an optical model
 MAX_NONLINEARITY = 0.1
-"""Accepted relative difference of the gains at full and half amplitude, in addition to `_STANDARD_ERRORS` errors."""
+"""Accepted relative difference of the gains at full and half amplitude, beyond `_STANDARD_ERRORS` of its errors."""
 _STANDARD_ERRORS = 3.0  # number of standard errors
 
 
@@ -136,7 +136,7 @@ def linear_amplitude_nm(player: Player, config: Configuration, delay: Delay, def
             plan = _poke_cycle(modes, amplitude_nm, repetition)
             gains[level, repetition] = np.diag(R @ player.cycle(plan, delay.delay_frames).response)
     difference = np.abs(gains[0].mean(axis=0) / gains[1].mean(axis=0) - 1)
-    variance = gains.var(axis=1, ddof=1).mean(axis=0)  # of one gain; that of a difference of means of two is equal
+    variance = gains.var(axis=1, ddof=1).mean(axis=0)  # of one gain; a difference of two means of two has the same
     error = np.sqrt(np.maximum(variance, variance.mean()))
     worst = int((difference - _STANDARD_ERRORS * error).argmax())
     chosen_nm = default_nm / 2 if difference[worst] > MAX_NONLINEARITY + _STANDARD_ERRORS * error[worst] else default_nm

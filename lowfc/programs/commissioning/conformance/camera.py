@@ -20,7 +20,7 @@ STORED_IMAGES = 50
 
 
 class FrameRecord(NamedTuple):
-    """A frame without pixels; `publish_time_ns` is 0 without a valid envelope, `highest_dn` None if sizes disagree."""
+    """A frame without pixels; `publish_time_ns` is 0 without a valid envelope, `highest_dn` None if sizes misfit."""
 
     receive_time_ns: int
     publish_time_ns: int

@@ -208,7 +208,7 @@ class Dialogue(CollectedMessages):
         return height_nm / self.expected.move_nm < _MAX_MOVES
 
     def moved(self, before_nm: Single, state: wire.MirrorState) -> bool:
-        """Whether a state differs from a former surface by more than a driver step, or cannot be compared."""
+        """Whether a state differs from a former surface by more than a driver step, or has no usable surface."""
         found = self.surface_nm(state)
         if found is None:
             return True

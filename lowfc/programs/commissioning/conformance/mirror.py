@@ -193,8 +193,8 @@ def _applied(mirror: Dialogue, base_nm: Single, commanded_nm: Single, state: wir
         return ok(f"within {float(difference_nm.max()):.2g} nm")
     got = f"{differing.size} of {difference_nm.size} actuators off, by {float(difference_nm.max()):.3g} nm at most"
     if differing.size <= difference_nm.size // 10:
-        names = ", ".join(map(str, differing[:8]))
-        return warning(got, f"are they dead? Exclude them in the map mirror.active: {names}")
+        indices = ", ".join(map(str, differing[:8]))
+        return warning(got, f"are they dead? Exclude them in the map mirror.active: {indices}")
     moved = (np.abs(reported_nm - base_nm) > expected.tolerance_nm) & expected.moving
     if moved.any() and not moved.flat[differing].any():
         return wrong(got, "they do not move, the others do: exclude those without a channel in the map mirror.active")
@@ -269,7 +269,7 @@ def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
         advice = "before any move, check shape, byte count, isfinite, and frame_sequence not below the last"
         yield judged(name, expected, not bad, "nothing changed", advice, got)
     state, _, _ = mirror.ask(base_nm)
-    if state is None or (mirror.failed and lost_commands >= 4):  # not a stall of this host
+    if state is None or (mirror.failed and lost_commands >= 4):  # one after each: no stall of this host
         expected, advice = "valid commands are applied after invalid ones", "catch decoding errors, and continue"
         got = "no more answers" if state is None else "the first valid command after each invalid one is lost"
         yield judged("after bad commands", expected, False, got, advice)

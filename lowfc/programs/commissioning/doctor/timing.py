@@ -68,7 +68,7 @@ def _processors(facts: Facts) -> Check:
     named = named_cpus(facts.config)
     if named and (missing := named - facts.completed_trial.cpus):
         return warning(
-            f"{detail}; the configuration names {ranges(missing)}, which lowfc may not use",
+            f"{detail}; the configuration names {ranges(missing)}, on which lowfc cannot run",
             "correct realtime.camera_cpus, controller_cpus, mirror_cpus and recorder_cpus",
             "the kernel moves the loop between processors; expect a longer tail of the latencies",
         )
@@ -219,8 +219,8 @@ def _clock_source(facts: Facts) -> Check:
 @CHECKS.check(
     "synchronisation",
     advice="run chronyd (with rtcsync), ntpd, systemd-timesyncd or phc2sys before the first run after a boot",
-    cost="the first run after a boot sets the clock of all runs to CLOCK_REALTIME: times in logs keep that error, and "
-    "times of two hosts cannot be compared; later steps of CLOCK_REALTIME do not affect the loop",
+    cost="the first run after a boot sets the clock of all runs to CLOCK_REALTIME: times in logs keep its error of "
+    "that moment, and times of two hosts cannot be compared; later steps of CLOCK_REALTIME do not affect the loop",
 )
 def _synchronisation(facts: Facts) -> Check:
     """Whether a daemon synchronises CLOCK_REALTIME, and the error that the kernel reports."""

@@ -236,7 +236,7 @@ def _prior_warnings(state: wire.ControllerState | None, calibration: Calibration
     if not names:
         return []
     return [
-        f"the reconstructor has a prior of the modes that automatic gains do not correct ({names}): if these modes get "
+        f"the reconstructor has a prior for the modes that automatic gains do not correct ({names}): if these get "
         "gains, the noise of the other modes is higher than predicted"
     ]
 

@@ -105,10 +105,14 @@ def calibration_columns(calibration: Calibration) -> list[Column]:
 
 
 def _truth(history: History) -> list[Column]:
-    true, modes, pupil = history.true, "each mode, wavefront rms", "wavefront rms over the open pupil, without piston"
+    true, modes, pupil = (
+        history.true,
+        "each mode, nm rms of wavefront",
+        "wavefront rms over the open pupil, without piston",
+    )
     if true is None:
         return []
-    when = "rms over the frame period" if true.continuous else "at the start of the exposure"
+    when = "root mean square over the frame period" if true.continuous else "at the start of the exposure"
     return [
         Column("true_disturbance_nm", true.disturbance_nm, "nm", f"{modes}, at the start of the exposure"),
         Column("true_residual_nm", true.residual_nm, "nm", f"{modes}, at the start of the exposure"),

@@ -1,7 +1,8 @@
 """Choice of the keys of a log to republish, and of the roles to republish them in.
 
-The camera, the controller and the mirrors published most topics of a log. `lowfc publish` takes over these roles,
-including their ports, so that each role belongs either to the log or to a live process, never to both.
+Most topics of a log were published by a role of the loop: camera, controller or a mirror. `lowfc publish` takes over
+the roles of the topics that it publishes, including their ports, so that each role belongs either to the log or to a
+live process, never to both.
 """
 
 from collections.abc import Collection, Sequence

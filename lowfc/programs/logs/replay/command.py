@@ -45,8 +45,8 @@ def replay_log(
 ) -> None:
     """Replay the recorded inputs through the controller, and compare every step and command with the log, bit for bit.
 
-    Exit status 0 only if all that could be compared are identical, or differ by at most --tolerance; never with another
-    kernel. Logs may be complete, rotated, truncated or damaged.
+    The exit status is 0 only if everything that could be compared is identical, or differs by at most --tolerance, and
+    the kernel is the log's. Logs may be complete, rotated, truncated or damaged.
 
     Example: lowfc replay last
     """

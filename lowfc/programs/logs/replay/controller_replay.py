@@ -26,7 +26,7 @@ from lowfc.programs.logs.replay.frames import Frames
 
 PATIENCE_NS = 2_000_000_000
 """Longest log time to wait for a message of another publisher, because a log is in the order of arrival."""
-_STATES_KEPT = 256  # newest replayed states, or logged states while none is adopted
+_STATES_KEPT = 256  # newest replayed states; before the replay has adopted a state, newest logged states
 _BEFORE_STATE = "recorded before the first complete state of the controller"
 
 
@@ -91,7 +91,7 @@ class ControllerReplay:
     """
 
     def __init__(self, context: Context, begun_ns: int) -> None:
-        """Replay a controller whose first message has the log time `begun_ns`, which decides its segment."""
+        """Replay a controller; `begun_ns`, the log time of its first message, decides which segment replays it."""
         self.done = begun_ns >= context.segment.until_ns
         self.retry_pending = False
         self._context, self._account = context, context.account
@@ -106,7 +106,7 @@ class ControllerReplay:
         self._settings: Settings  # set with each adopted state
         self._state: State | None = None
         self._recent_states: deque[State] = deque(maxlen=_STATES_KEPT)
-        # Empty: the steps before the next state belong to another segment, which counts them.
+        # Why steps are not checked before the next state is adopted; empty if another segment counts them.
         self._unchecked_because = _BEFORE_STATE if begun_ns >= context.segment.from_ns else ""
         self._counts_earlier = bool(self._unchecked_because)  # whether steps before the adopted state are counted
 
@@ -287,7 +287,7 @@ class ControllerReplay:
         return None
 
     def _apply_changed_rule(self, rule: str, input_: Input, logged: wire.ControllerState) -> None:
-        """Apply an input whose rule has changed since the log. If the result differs, continue from the log's state."""
+        """Apply an input that the log's version handled by another rule; after a difference, go on from its state."""
         assert self._state is not None  # noqa: S101  # adopted before
         state, _ = advance(self._settings, self._state, input_)
         replayed = controller_state(state, self._settings, from_timestamp(logged.timestamp))
@@ -316,7 +316,7 @@ class ControllerReplay:
                 logged.state.CopyFrom(self._reencoded(logged.state))
             logged, replayed = self._context.former.compared(logged), self._context.former.compared(replayed)
         if replayed == logged and (self._context.former is not None or isinstance(logged, wire.ControllerState)):
-            return None  # other messages of this version must be equal byte by byte, too
+            return None  # for other messages of this version equal fields are not enough: the bytes count
         return difference(state.input_number, state.frame_sequence, logged, replayed)
 
     def _reencoded(self, logged: wire.ControllerState) -> wire.ControllerState:

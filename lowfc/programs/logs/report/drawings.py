@@ -154,12 +154,12 @@ def _spectra(figure: "Figure", report: Report) -> bool:
         above, below = grid[0][column], grid[1][column]
         frequency_hz, power = group["frequency_hz"], {k: np.array(v) for k, v in group["power_nm2_hz"].items()}
         true = "disturbance" in power
-        measured = _BESIDE_TRUTH if true else {}
-        above.plot(frequency_hz, power["pseudo_open_loop"], color=OPEN, label="open: pseudo-open-loop", **measured)
-        above.plot(frequency_hz, power["error"], color=CLOSED, label="closed: measured error", **measured)
+        style = _BESIDE_TRUTH if true else {}
+        above.plot(frequency_hz, power["pseudo_open_loop"], color=OPEN, label="open: pseudo-open-loop", **style)
+        above.plot(frequency_hz, power["error"], color=CLOSED, label="closed: measured error", **style)
         ratio = np.sqrt(_ratio(power["error"], power["pseudo_open_loop"]))
         theory = np.sqrt(_ratio(power["error_predicted"], power["pseudo_open_loop"]))
-        below.plot(frequency_hz, ratio, color=CLOSED, label="measured error / pseudo-open-loop", **measured)
+        below.plot(frequency_hz, ratio, color=CLOSED, label="measured error / pseudo-open-loop", **style)
         below.plot(frequency_hz, theory, color=INK, linestyle="--", linewidth=0.9, label="theory: rejection")
         if true:
             above.plot(frequency_hz, power["disturbance"], color=OPEN, label="open: true disturbance")

@@ -39,7 +39,7 @@ def require_page() -> None:
 
 
 def number(value: float | str | None, digits: int = 3) -> str:
-    """A number in running text with this many significant digits, or all digits of its integer; or `NOT_IN_LOG`."""
+    """A number in running text with at least this many significant digits, its integer part whole; or `NOT_IN_LOG`."""
     if value is None:
         return NOT_IN_LOG
     if isinstance(value, str | int):

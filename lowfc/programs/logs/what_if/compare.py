@@ -113,7 +113,7 @@ def what_if(run: LoggedRun, changes: WhatIf) -> dict[str, Any]:
 def _true_residuals(
     run: LoggedRun, rows: Mask, moved_nm: Single, command_nm: Single
 ) -> tuple[dict[str, Array], dict[str, Any] | None]:
-    """Rms (modes,) in nm of the true residual, at the frames and at all times, as logged and for the what-if.
+    """Rms (modes,) in nm of the true residual, at starts of exposures and continuous, as logged and for the what-if.
 
     `moved_nm` (steps, modes) is the what-if's command minus the logged one, as seen by each exposure; `command_nm` is
     the what-if's command. The second value is the contrast that the continuous residual adds to the dark zone, or None.
@@ -239,7 +239,9 @@ def _tilt_mas(run: LoggedRun, columns: dict[str, Array]) -> dict[str, float]:
     if run.history.configuration is None or not tilts.any():
         return {}
     nm_per_mas = tilt_nm_per_mas(run.history.configuration.star.diameter_m)
-    return {f"tilt_{name}_mas": float(np.sqrt(np.mean(nm[tilts] ** 2))) / nm_per_mas for name, nm in columns.items()}
+    return {
+        f"tilt_{name}_mas": float(np.sqrt(np.mean(rms_nm[tilts] ** 2))) / nm_per_mas for name, rms_nm in columns.items()
+    }
 
 
 def _log_warnings(run: LoggedRun) -> list[str]:
@@ -318,7 +320,7 @@ def _prior_warnings(run: LoggedRun, calibration: Calibration, law: Integrator | 
         return []
     names = ", ".join(mode_name(index) for index in np.array(run.calibration.noll)[uncorrected].tolist())
     return [
-        f"the logged reconstructor has a prior of the modes that automatic gains did not correct ({names}): the "
+        f"the logged reconstructor has a prior for the modes that automatic gains did not correct ({names}): the "
         "what-if measures with the same prior, even if it corrects such a mode"
     ]
 

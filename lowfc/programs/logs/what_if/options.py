@@ -46,15 +46,18 @@ class WhatIf:
 
 
 def requested_changes(
-    pairs: str | None = None, config: Path | None = None, calibration: Path | None = None, controller: str | None = None
+    assignments: str | None = None,
+    config: Path | None = None,
+    calibration: Path | None = None,
+    controller: str | None = None,
 ) -> WhatIf:
-    """Parse the options of the command line; `pairs` is the text of --set: KEY=VALUE,...
+    """Parse the options of the command line; `assignments` is the text of --set: KEY=VALUE,...
 
     A controller is FILE.py:NAME of a function `step(state, error_nm) -> (state, command_nm)`; the state is None at
     first; both arrays are (modes,) nm rms of wavefront.
     """
     values: dict[str, str] = {}
-    for part in filter(None, (part.strip() for part in (pairs or "").split(","))):
+    for part in filter(None, (part.strip() for part in (assignments or "").split(","))):
         key, _, value = (piece.strip() for piece in part.partition("="))
         if key not in KEYS:
             raise ConfigurationError(f"--set: unknown key {key!r}{nearest(key, KEYS)}; the keys are {', '.join(KEYS)}")
@@ -69,7 +72,7 @@ def requested_changes(
     if estimator not in (None, *ESTIMATORS):
         raise ConfigurationError(f"--set: estimator must be {' or '.join(ESTIMATORS)}, got {estimator!r}")
     if controller is not None and values:
-        raise ConfigurationError(f"--set: {', '.join(values)} apply to the integrator, not to your own controller")
+        raise ConfigurationError(f"--set: {', '.join(values)}: only for the integrator, not for your own controller")
     overrides = {key: _number(key, value) for key, value in values.items()}
     return WhatIf(
         overrides,
@@ -143,5 +146,5 @@ def _number(key: str, value: str) -> float:
     except ValueError:
         raise ConfigurationError(f"--set: {key} must be a number, got {value!r}") from None
     if abs(number) > MAX_LIMIT_NM:  # larger numbers may overflow in single precision
-        raise ConfigurationError(f"--set: {key} must be between -{MAX_LIMIT_NM:g} and {MAX_LIMIT_NM:g}, got {value}")
+        raise ConfigurationError(f"--set: {key} must be at most {MAX_LIMIT_NM:g} in magnitude, got {value}")
     return number

@@ -58,8 +58,8 @@ def latency(
 
     Prepared frames are sent on an absolute schedule and late frames are counted, so that stalls are not hidden. A bare
     zenoh echo of messages of the same sizes, one control step alone and the host's timer are measured in turns with
-    the loop. The latency from frame to command begins just before the frame is published, and ends
-    just after its command is sent.
+    the loop. The latency from frame to command begins just before the frame is published, and ends just after its
+    command is sent.
 
     Example: lowfc latency --duration 10 --repeats 5 --json > latency.json
     """

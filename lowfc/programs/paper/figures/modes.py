@@ -39,7 +39,7 @@ _DEVIATION = 0.1  # relative deviation from linearity that ends the linear range
 
 
 def _matched(sensor: Prepared) -> Input:
-    """The interpretation of Sect. 3.1 whose rms matches the input of Table 3."""
+    """Bounds of the coefficients (Sect. 3.1), scaled so that the input's rms is that of Table 3."""
     return next(inputs(sensor, MODES, literal=False))
 
 

@@ -196,7 +196,7 @@ def _table4(context: Context) -> list[Row]:
 
 
 def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
-    """Rows of the noise of each mode's mean over `AVERAGED_S`, simulated as one exposure with all light and noise."""
+    """Rows of the noise of each mode's mean over `AVERAGED_S`, simulated as one exposure: all light and read noise."""
     frames = AVERAGED_S * tolerance.RATE_HZ
     sensor, light_e = prepared(name), tolerance.light_e(MAGNITUDE)
     normalised_I0, R = sensor.loop_fit(sensor.I0, sensor.H[:, : len(NOLLS_14)], light_e, tolerance.READ_NOISE_E)

@@ -150,7 +150,7 @@ def mean_and_error(values: Array) -> tuple[float, float]:
 def table3(context: Context) -> list[Row]:
     """Rows of Table 3: input, then rms and P-V residual for each sensor, number of modes, input and estimator."""
     rows: list[Row] = []
-    with_input_rows: set[tuple[bytes, int, str]] = set()
+    inputs_shown: set[tuple[bytes, int, str]] = set()
     for name in context.names(*sparse_apertures(), *OTHER_SENSORS):
         sensor = prepared(name)
         in_paper = name in ("sam", "clowfs")
@@ -159,10 +159,10 @@ def table3(context: Context) -> list[Row]:
                 estimated = ensemble(
                     context, name, modes, wavefronts, nuisances=in_paper and wavefronts.name == "matched"
                 )
-                drawn_on = sensor.open.tobytes(), modes, wavefronts.name
-                if drawn_on not in with_input_rows:
+                pupil_and_input = sensor.open.tobytes(), modes, wavefronts.name
+                if pupil_and_input not in inputs_shown:
                     rows += _input_rows(sensor, modes, wavefronts, estimated)
-                    with_input_rows.add(drawn_on)
+                    inputs_shown.add(pupil_and_input)
                 rows += _residual_rows(sensor, modes, wavefronts, estimated)
     return rows
 

@@ -34,7 +34,7 @@ _LOOP_MODE = rb"\b(OPEN|CLOSED)\b"
 
 @case(
     "console",
-    "a console of a loop at 1 kHz receives 2,000 events a second, is stopped (SIGSTOP), and is killed",
+    "a console of a loop at 1 kHz receives 2,000 events a second, is suspended (SIGSTOP), and is killed",
     config={"camera.rate_hz": 1000.0},
     allowed=LOST,
 )

@@ -1,4 +1,4 @@
-"""Chaos cases: processes that are killed or stopped."""
+"""Chaos cases: processes that are killed or suspended."""
 
 import contextlib
 import time
@@ -21,7 +21,7 @@ RANDOM_FAULTS = 6
 _SETTLE_S = 0.3
 _STATIC = {"disturbance.static_nm": {"4": 40.0}}
 
-# Events that the log must have if the process of a role is killed, and if it is stopped.
+# Events that the log must have if the process of a role is killed, and if it is suspended.
 _EVENTS: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
     Role.CAMERA: (("CAMERA_RESTARTED",), ("NO_FRAMES", "FRAMES_BACK")),
     Role.CONTROLLER: (("STARTED controller",), ("COMMAND_EXPIRED", "COMMAND_BACK")),
@@ -40,8 +40,8 @@ def kill_and_restart(bench: ChaosBench, role: Role, after_s: tuple[float, float]
     bench.restart(name)
 
 
-def stop_and_continue(bench: ChaosBench, role: Role, for_s: tuple[float, float] = (0.5, 2.0)) -> None:
-    """Stop a process (SIGSTOP), and continue it after a random time in this range."""
+def suspend_and_continue(bench: ChaosBench, role: Role, for_s: tuple[float, float] = (0.5, 2.0)) -> None:
+    """Suspend a process (SIGSTOP), and continue it after a random time in this range."""
     name = bench.process(role)
     bench.pause(0.0, 0.5)
     with bench.suspended(name):
@@ -54,7 +54,7 @@ for _role, (_names, _) in _EVENTS.items():
     )
 for _role, (_, _names) in _EVENTS.items():
     process_case(f"freeze-{_role}", f"SIGSTOP of the {_role}, SIGCONT 0.5 to 2 s later", expected=_names)(
-        partial(stop_and_continue, role=_role)
+        partial(suspend_and_continue, role=_role)
     )
 process_case(
     "silent-camera",
@@ -77,16 +77,16 @@ def _at_random(bench: ChaosBench) -> None:
         if bench.rng.random() < 0.5:
             kill_and_restart(bench, role)
         else:
-            stop_and_continue(bench, role, (0.1, 1.0))
+            suspend_and_continue(bench, role, (0.1, 1.0))
         bench.pause(0.0, 1.0)
 
 
-@process_case("stall-recorder", "the recorder is stopped (SIGSTOP) for 10 s")
+@process_case("stall-recorder", "the recorder is suspended (SIGSTOP) for 10 s")
 def _stalled_recorder(bench: ChaosBench) -> None:
     compare(bench, partial(bench.suspended, Role.RECORDER))
 
 
-@process_case("stall-viewer", "the viewer is stopped (SIGSTOP) for 10 s")
+@process_case("stall-viewer", "the viewer is suspended (SIGSTOP) for 10 s")
 def _stalled_viewer(bench: ChaosBench) -> None:
     name = bench.process(Role.VIEWER)
     bench.await_settled()

@@ -72,7 +72,7 @@ class Spectra(Panel):
             elif ended and modes.any() and axes.path in self._last:  # no more frames will come
                 text, frequency_hz, powers = self._last[axes.path]
                 text += " before a change"
-            if powers and rate_hz:  # otherwise there is no curve, or the curves of the last drawing stay
+            if powers and rate_hz:  # otherwise the axes stay: without a curve, or with those of the last drawing
                 self._fit(stream, axes, rate_hz, np.concatenate(powers))
             axes.draw(stream, np.log10(frequency_hz), [np.log10(power) for power in powers], _COLOURS, _WIDTHS)
             stream.log(f"{axes.path}/state", labels([_STATE_POSITION], [text]))

@@ -25,8 +25,8 @@ WIDTH, HEIGHT = 1760, 256  # px
 GROUND: Colour = (13, 16, 17)
 """Rerun's background, so that only the tiles are visible."""
 MIN_PERIOD_NS = 250_000_000
-"""Shortest time between pictures with another word or colour. If only numbers differ, there is one picture per second:
-more cannot be read, and each stays in the viewer's memory."""
+"""Shortest time between two pictures that differ in a word or colour. If only numbers differ, there is one picture per
+second: more cannot be read, and each stays in the viewer's memory."""
 
 _GAP, _INSET, _BAND, _CLOCK = 6, 9, 46, 190  # gap of boxes, inset of text, height of headline, width of clock, px
 _TILES_END = 196  # lower edge of the tiles, px

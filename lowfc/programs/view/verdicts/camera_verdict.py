@@ -16,9 +16,9 @@ MANY_LOST = 0.1
 """Fraction of frames lost above which the loop no longer behaves as tuned."""
 DARK, DIM, BRIGHT = 0.2, 0.5, 2.0
 """Fractions of the expected light. Below a fifth of it, the controller refuses frames by default; at half of it, the
-photon noise is 1.4 times larger; with more than twice as much, the star is not the calibrated one."""
+photon noise of the modes is 1.4 times larger; with more than twice as much, the star is not the calibrated one."""
 HEALTH_OVERDUE_S = 4.0
-"""Time without a frame after which a camera that still sends Health certainly runs: a dead one would be silent."""
+"""Time without a frame after which a camera that does not count as silent certainly runs: a dead one would by then."""
 
 REFUSED: dict[Reason, tuple[str, str]] = {
     Rejection.DARK: ("too dark", "the star is gone; check pointing, shutter and clouds"),
@@ -62,7 +62,7 @@ def frames(state: RunState) -> Tile:
         alive = camera.life is not Liveness.SILENT and silent_s > HEALTH_OVERDUE_S
         cause = "the camera runs, but sends none" if alive else "camera silent"
         since = duration(silent_s)
-        advice = f"No frame for {since}, {cause}: {effect}. Check the camera's last output and restart it."
+        advice = f"No frame for {since}, {cause}: {effect}. Check what its process printed last, and restart it."
         return tile("NO FRAMES", f"for {since}: {cause}", Level.BAD, advice)
     lost = state.recent["skipped"] + state.recent["missing"]
     period_ns = state.snapshot.period_ns
