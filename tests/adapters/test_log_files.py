@@ -257,7 +257,11 @@ INVALID_LENGTHS = [
             for start in INVALID_STARTS
         ),
         ([DECLARED, message(1), chunk(message(2))], "outside the chunks", [0, 2]),
-        ([chunk(STEPS, CHANNEL, message(0), message(1, channel=2))], "the declaration of its messages is missing", [0]),
+        (
+            [chunk(STEPS, CHANNEL, message(0), message(1, channel=2))],
+            "the record of a channel or schema is missing",
+            [0],
+        ),
         *(([DECLARED, lz4_chunk(records), chunk(message(2))], "is damaged", [0, 2]) for records in INVALID_LENGTHS),
     ],
 )

@@ -127,7 +127,7 @@ def normalise_flux(reference: Array, response: Array, good: Array) -> tuple[Arra
 
 
 def for_unnormalised_images(reconstructor: Array, reference: Array, good: Array) -> Array:
-    """R' (modes, pixels) for images not divided by their flux: R' H = R N, with N the normalised H."""
+    """R' (modes, pixels), nm per unit of I0, for images not divided by their flux: R' H = R N, N the normalised H."""
     flux = _flux(reference, good)
     return np.asarray((reconstructor - np.outer(reconstructor @ reference / flux, good)) / flux)
 

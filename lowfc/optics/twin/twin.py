@@ -51,7 +51,7 @@ class Operator:
         weight: Weight of this wavelength in the image of the band.
         modes: (rows, rank) the first singular vectors, orthonormal, of the matrix that `field_operator` returns.
         to_modes: (rank, used) real matrix from exp(i phi) at the used nodes to amplitudes of the modes. It is
-            scaled so that |E|^2 has the units of the image.
+            scaled so that the squared field has the units of the image.
         to_coefficients: (functions squared, rank) matrix from amplitudes of the modes to coefficients of products of
             the functions; real with an aperture mask, else complex.
         basis: (points, functions) complex: prolate functions at the points, each times its phase, a power of i.

@@ -350,9 +350,7 @@ class Controller:
             if reply.accepted:
                 continue
             law = request.name == "law"
-            unfit = law and (
-                misfit_cause(self._state) or uncalibrated_cause(self._state)
-            )  # the loop stays open or idle
+            unfit = law and (misfit_cause(self._state) or uncalibrated_cause(self._state))  # the loop stays open
             # Once the controller runs, clients may have changed the loop, so that a refusal is no fault of the file.
             if unfit or (self._mirror_adopted and request.text != ADOPTED):
                 self._service.event("LAW_NOT_IN_FORCE" if law else "FLAT_NOT_IN_FORCE", why=reply.text)
