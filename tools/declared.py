@@ -37,7 +37,7 @@ from tools.shared import ROOT, markdown
 API = ("client", "device", "optics", "design", "control")
 """Packages of the Python API."""
 _MESSAGES, _FIELDS = 4, 2  # field numbers of `message_type` and `field`: protoc stores comments under such paths
-_UNCOMMENTED = {"timestamp": "Time of the reported quantity"}
+_UNCOMMENTED = {"timestamp": "Time of the reported quantity; of a command, that of its frame"}
 _NEW_LAW = (
     ("frames for which a new law observes", SETTLING_FRAMES),
     ("frames of the cross-fade to a new law", FADING_FRAMES),

@@ -34,7 +34,7 @@ from tests.support.report_log import TOY_CALIBRATION, SyntheticLog
 MULTISINE = {"duration_s": 3.0, "rms_nm": 3.0, "lines_per_mode": 8, "modes": (), "seed": 1}
 THREE_MODES = {
     "disturbance.preset": "quiet",
-    "camera.instants": 1,  # per exposure; one suffices, as the wavefront changes only with the mirror
+    "camera.instants": 1,  # in a period; one suffices, as the wavefront changes only with the mirror
     "sensor.modes": 3,
     "star.magnitude": -1.0,
     "control.gain": 0.3,
@@ -291,7 +291,7 @@ def test_a_disturbed_test_that_was_repeated_does_not_count(tmp_path: Path) -> No
     assert len(responses_in(log)) == 1
 
 
-def test_a_log_that_ends_within_a_test_is_refused_with_what_is_missing(tmp_path: Path) -> None:
+def test_a_log_that_ends_within_a_test_is_refused_and_the_error_says_what_is_missing(tmp_path: Path) -> None:
     log = SyntheticLog().frames(20).request("note", text=CLOSED_NOTE).frames(40).write(tmp_path / "night.mcap")
     error = r"ends 10 of 50 frames before the end of a measurement \(noise-floor, loop closed\): give all files"
     with pytest.raises(DataFileError, match=error):

@@ -220,13 +220,13 @@ def not_closed_ns(rig: Rig) -> int:
     return health.not_closed_ns
 
 
-def test_the_time_not_closed_is_counted_from_the_first_frame(rig: Rig) -> None:
+def test_the_time_with_the_loop_not_closed_is_counted_from_the_first_frame(rig: Rig) -> None:
     rig.expose(20)
     rig.steps(1)
     assert not_closed_ns(rig) == 19 * CONFIG.period_ns
 
 
-def test_the_time_not_closed_ends_with_the_newest_frame(calibration: Calibration, scene: Scene) -> None:
+def test_the_time_with_the_loop_not_closed_ends_with_the_newest_frame(calibration: Calibration, scene: Scene) -> None:
     with running(configured(lockstep=False), calibration, scene) as rig:
         rig.expose(2)
         before_ns = not_closed_ns(rig)
@@ -307,7 +307,9 @@ def test_a_loop_whose_latch_cannot_be_written_starts_open(calibration: Calibrati
     warnings: list[str] = []
     _, service, controller = lone_controller(calibration, Latch([tmp_path / "file" / "safe"], warnings.append), CLOSED)
     assert service.awaited() == "a camera"
-    assert service.state == "starting", "opening a camera may take longer than the watchdog waits"
+    assert service.state == "starting", (
+        "not ready before a camera reports: opening it may outlast the watchdog's timeout"
+    )
     assert (mode_of(controller), len(warnings)) == (LoopMode.OPEN, 1)
 
 
@@ -438,19 +440,19 @@ def test_start_requests_refused_because_clients_changed_the_loop_do_not_end_the_
     until(lambda: {"LAW_NOT_IN_FORCE", "FLAT_NOT_IN_FORCE"} <= set(listener.events()))
 
 
-def test_an_automatic_gain_request_dated_by_the_cameras_clock_ends_no_reservation(
+def test_an_automatic_gain_request_with_the_time_of_a_frame_ends_no_lease(
     calibration: Calibration, tmp_path: Path
 ) -> None:
     _, _, controller = lone_controller(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     assert controller._carry_out_internal(Request(0, "lease", (), (5.0,), "somebody", lease_id=1)).accepted
-    reply = controller._carry_out_internal(Request(2**62, "gain", (), (0.1,), "auto"))  # dated by a frame
+    reply = controller._carry_out_internal(Request(2**62, "gain", (), (0.1,), "auto"))  # its time is a frame's
     assert (reply.accepted, "the loop is reserved for somebody" in reply.text) == (False, True)
 
 
-def test_a_fault_of_the_mirror_and_another_fault_after_it_count_after_two_healths_in_a_row(
+def test_a_mirror_fault_counts_from_the_second_faulty_health_and_is_replaced_after_two_equal_ones(
     calibration: Calibration, tmp_path: Path
 ) -> None:
-    """A mirror that has just recovered is still without a command. An unknown reason is a fault, too."""
+    """A mirror that has just recovered reports once that it has no command. An unknown reason is a fault, too."""
     listener, _, controller = lone_controller(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     report_shape(listener)
     assert controller._mirror.first() is not None

@@ -226,7 +226,7 @@ def test_an_older_state_does_not_replace_a_newer_one() -> None:
     assert accumulated([new, old]).snapshot(0).controller == wire.ControllerState()
 
 
-def test_a_complete_snapshot_has_every_picture_since_the_previous_complete_one() -> None:
+def test_a_complete_snapshot_has_the_newest_pictures_even_if_an_incomplete_one_had_them() -> None:
     accumulator = accumulated(synthetic_log().samples)
     incomplete = accumulator.snapshot(0, complete=False)
     assert incomplete.frame is not None

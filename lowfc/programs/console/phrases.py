@@ -1,4 +1,4 @@
-"""Sentences of the loop in the console: with keys in place of `lowfc` commands, and ranges in place of long lists."""
+"""Replies and events as the console shows them: keys in place of `lowfc` commands, ranges in place of long lists."""
 
 import re
 

@@ -33,11 +33,11 @@ from lowfc.programs.commissioning.acceptance.probe import (
 
 KIND: Kind = "rejection"
 MIN_JUDGED = 0.5
-"""Smallest fraction of a mode's lines at which the rejection must be certain enough to judge.
+"""A mode passes only if the rejection is certain enough to judge at this fraction of its lines or more.
 
 The noise transfer has no such limit: where it is small, it is below the measurement noise.
 """
-_LEAD_FRAMES = 50  # frames before the period, added to those of settling: the bus delivers the first steps late
+_LEAD_FRAMES = 50  # frames before the multisine in addition to those of settling: the first steps may come late
 
 
 class Comparison(Result):

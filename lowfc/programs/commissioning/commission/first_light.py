@@ -89,7 +89,7 @@ def calibration_with_reference(
 ) -> Calibration:
     """A calibration with the reference image of these frames (frames, rows, columns), and no response yet.
 
-    Its modes and the mirror's commands come from the calibration `computed`.
+    Its modes and its matrix from modes to actuators are those of the calibration `computed`.
     """
     pixels, saturation_dn = frames.reshape(len(frames), -1), float(sensor.camera.saturation_dn)
     brightest_dn = int((pixels.max(axis=0) * (sensor.good > 0)).max())

@@ -11,7 +11,7 @@ from lowfc.contract.messages import CAMERA_STATE, HEALTH, TOPICS, wire
 
 
 class Peers:
-    """The last `Health.state` of each process; `newest` has the last message of every other key that can be queried.
+    """The last `Health.state` of each process; `newest` has the last message of every queryable key but Health.
 
     A log starts with the messages in `newest`: calibration, law, probe table, bench values, and the states of camera
     and controller.

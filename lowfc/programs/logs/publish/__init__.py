@@ -1,1 +1,1 @@
-"""`lowfc publish`: republish a log on the bus, at the recorded rate."""
+"""`lowfc publish`: republish a log on the bus, at the recorded speed or another."""

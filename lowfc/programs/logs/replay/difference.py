@@ -10,7 +10,7 @@ from google.protobuf.message import Message
 from lowfc.arrays import Array
 
 _FLOAT32_FIELD = "actuators"
-"""Field whose bytes hold little-endian float32, nm; in channels (a repeated message) it is compared exactly."""
+"""Field whose bytes hold little-endian float32, nm. In the repeated message `channels` it is compared exactly."""
 _IN_NM = ("_nm", "actuators", "law_state")
 """Endings of the names of fields in nm; the state of a user's linear law, whatever its unit, is treated like nm."""
 _MAX_SHOWN = 4

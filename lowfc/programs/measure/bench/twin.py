@@ -84,7 +84,7 @@ def bench_twin(seconds: float = 1.0) -> dict[str, Any]:
 
 def render(result: dict[str, Any]) -> str:
     """The result of `bench_twin` as a table."""
-    lines = [f"{'twin':<36} {'twin':>9} {'full chain':>12} {'ratio':>7} {'relative L2':>12}"]
+    lines = [f"{'case':<36} {'twin':>9} {'full chain':>12} {'ratio':>7} {'relative L2':>12}"]
     lines += [
         f"{case['name']:<36} {case['twin_us']:>6.0f} us {case['full_us']:>9.0f} us {case['ratio']:>6.0f}x "
         f"{case['relative_l2']:>12.1e}"
