@@ -157,7 +157,8 @@ def _tilt_contradiction(sam: Prepared) -> Iterator[Row]:
         "",
         float(np.abs(differential(sam, 2)).max()),
         PAPER_TILT_PEAK,
-        assumption="If the signal of 1 mas reaches the 2.5 % of Sect. 3.3, the peak for lambda/30 exceeds that of Table 2.",
+        assumption="If the signal of 1 mas reaches the 2.5 % of Sect. 3.3, the peak for lambda/30 exceeds that of "
+        "Table 2.",
     )
 
 
