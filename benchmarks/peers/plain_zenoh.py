@@ -54,12 +54,8 @@ def join(role_process: RoleProcess, receive: MessageFunction) -> MessageFunction
 
 def source(role_process: RoleProcess) -> None:
     """Send the frames, and record when their commands arrive."""
-    received, published, now_ns = (
-        role_process.time_stamps("received"),
-        role_process.time_stamps("published"),
-        time.monotonic_ns,
-    )
-    last = role_process.last_actuators()
+    received, published = role_process.time_stamps("received"), role_process.time_stamps("published")
+    last, now_ns = role_process.last_actuators(), time.monotonic_ns
 
     def record_command(number: int, payload: bytes) -> None:
         received[number] = now_ns()

@@ -105,13 +105,10 @@ def calibration_columns(calibration: Calibration) -> list[Column]:
 
 
 def _truth(history: History) -> list[Column]:
-    true, modes, pupil = (
-        history.true,
-        "each mode, nm rms of wavefront",
-        "wavefront rms over the open pupil, without piston",
-    )
+    true = history.true
     if true is None:
         return []
+    modes, pupil = "each mode, nm rms of wavefront", "wavefront rms over the open pupil, without piston"
     when = "root mean square over the frame period" if true.continuous else "at the start of the exposure"
     return [
         Column("true_disturbance_nm", true.disturbance_nm, "nm", f"{modes}, at the start of the exposure"),
