@@ -204,11 +204,21 @@ def noise_nm(matrix: Array, reference: Array, flux_e: float, read_noise_e: float
 
 
 def noise_nm2(matrix: Array, reference: Array, flux_e: float, read_noise_e: float) -> Array:
-    """Covariance (modes, modes), nm^2, of the photon and read noise of one frame after R (modes, pixels).
+    """Covariance (modes, modes), nm^2, of the photon and read noise of one frame after R (modes, pixels)."""
+    return scaled_noise_nm2(unit_noise_nm2(matrix, reference), flux_e, read_noise_e)
+
+
+def unit_noise_nm2(matrix: Array, reference: Array) -> tuple[Array, Array]:
+    """Covariances (modes, modes), nm^2, of photon noise and of read noise, for a flux and a read noise of one electron.
 
     The normalisation divides by the frame's own noisy flux, so that each pixel's noise n acts as n - I0 sum(n).
     """
     good = (np.abs(matrix).sum(axis=0) > 0).astype(float)
-    variance = (np.maximum(reference, 0) * flux_e + read_noise_e**2) / flux_e**2
     effective = matrix - np.outer(matrix @ reference, good)
-    return np.asarray(effective * (variance * good) @ effective.T)
+    return effective * np.maximum(reference, 0) @ effective.T, effective @ effective.T
+
+
+def scaled_noise_nm2(unit_noise: tuple[Array, Array], flux_e: float, read_noise_e: float) -> Array:
+    """Covariance (modes, modes), nm^2, of the noise of one frame, from `unit_noise_nm2`."""
+    from_photons_nm2, from_read_out_nm2 = unit_noise
+    return np.asarray(from_photons_nm2 / flux_e + from_read_out_nm2 * (read_noise_e / flux_e) ** 2)

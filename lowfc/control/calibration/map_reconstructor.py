@@ -5,16 +5,21 @@ from functools import lru_cache
 import numpy as np
 
 from lowfc.arrays import Array, Single, single
-from lowfc.control.calibration.calibration import Calibration, noise_nm2
+from lowfc.control.calibration.calibration import Calibration, scaled_noise_nm2, unit_noise_nm2
 from lowfc.control.loop.camera import CameraSettings
 
 
-@lru_cache(maxsize=2)  # automatic gains need the same covariance when they are chosen, requested and applied
+@lru_cache(maxsize=2)  # slow; automatic gains need it between two frames
+def unit_covariances_nm2(calibration: Calibration) -> tuple[Array, Array]:
+    """The result of `unit_noise_nm2` for the calibration's own R; (modes, modes) each, nm^2."""
+    return unit_noise_nm2(calibration.reconstructor.astype(np.float64), calibration.reference.astype(np.float64))
+
+
 def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: CameraSettings | None) -> Array | None:
     """Covariance (modes, modes), nm^2, of the modes' noise in one frame, which is divided by its flux.
 
     It includes the photon noise of a frame whose image is I0, and read noise. None if the camera's gain or the flux is
-    unknown. Read-only.
+    unknown.
     """
     if camera is None or not camera.gain_e_per_dn > 0 or not flux_dn > 0:
         return None
@@ -22,10 +27,7 @@ def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: Camer
     excess = 2.0 if em_gain > 1 else 1.0
     flux_e = flux_dn * camera.gain_e_per_dn / em_gain
     read_noise_e = camera.read_noise_e / em_gain / excess**0.5
-    R, I0 = calibration.reconstructor.astype(np.float64), calibration.reference.astype(np.float64)
-    covariance = excess * noise_nm2(R, I0, flux_e, read_noise_e)
-    covariance.flags.writeable = False
-    return covariance
+    return excess * scaled_noise_nm2(unit_covariances_nm2(calibration), flux_e, read_noise_e)
 
 
 def map_rows(

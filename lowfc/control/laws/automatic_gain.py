@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lowfc.arrays import Array, Integers, Mask, Single
+from lowfc.control.laws.integrator import injected_fraction
 from lowfc.control.laws.stability import highest_gain
 from lowfc.control.laws.virtual import VirtualIntegrators, Weights
 
@@ -91,10 +92,9 @@ class GainBank:
         self._distinct = np.diff(self.rows, axis=0, prepend=-1) > 0
         self._at_rest = VirtualIntegrators.at_rest(self.rows, 1 - leak, limit_nm, weights)
         self._windows = windows
-        self._closed = self._closed_throughout = False
+        self._closed = self._closed_throughout = self._tilt_known = False
         self._waiting = 0  # frames in the arrays below that have not been summed
-        self._errors_nm = np.zeros((FRAMES_PER_SUM, *self.rows.shape), np.float32)
-        self._loop_nm = np.zeros((FRAMES_PER_SUM, leak.size), np.float32)
+        self._errors_nm = np.zeros((FRAMES_PER_SUM, len(self.rows) + 1, leak.size), np.float32)  # last row: real loop
         self._tilts_nm = np.zeros((FRAMES_PER_SUM, 2), np.float32)
         self.use_reconstructor(np.eye(leak.size))
         self.restart()
@@ -130,10 +130,11 @@ class GainBank:
             self._clear(self._windows[1])
         self._closed_throughout = self._closed_throughout and closed
         self._closed = closed
-        self._loops, self._errors_nm[self._waiting] = self._loops.advanced(open_nm)
-        self._loop_nm[self._waiting] = error_nm
+        errors_nm = self._errors_nm[self._waiting]
+        self._loops, errors_nm[:-1] = self._loops.advanced(open_nm)
+        errors_nm[-1] = error_nm
         if tilt_nm is not None:
-            self._tilts_nm[self._waiting] = tilt_nm
+            self._tilts_nm[self._waiting], self._tilt_known = tilt_nm, True
         self._waiting += 1
         self._frames += 1
         if self._frames < self._block:
@@ -263,7 +264,7 @@ class GainBank:
         Commands do not depend on the noise of later frames, so the differences of frames are independent.
         """
         return np.asarray(
-            mean < -GRANT_SIGMAS * np.sqrt(np.mean(self._spreads, axis=0) / (len(self._spreads) * self._block))
+            mean < -GRANT_SIGMAS * np.sqrt(np.mean(self._spreads, axis=0)[:-1] / (len(self._spreads) * self._block))
         )
 
     def _median_of_modes(self, blocks: Array) -> Array:
@@ -282,21 +283,20 @@ class GainBank:
         """Add the waiting frames to the sums of the block."""
         if not self._waiting:
             return
-        errors_nm, open_nm = self._errors_nm[: self._waiting], self._errors_nm[: self._waiting, 0]
-        self._tilt += self._cross_talk.add_frames(self._tilts_nm[: self._waiting], open_nm @ self._to_own.T)
-        before = open_nm[:0] if self._before_nm is None else self._before_nm
-        changes_nm = np.diff(open_nm, axis=0, prepend=before)
-        self._changes += np.square(changes_nm).sum(axis=0) / 2
-        self._changes_counted += len(changes_nm)
+        errors_nm = self._errors_nm[: self._waiting]
+        open_nm = errors_nm[:, 0]
+        if self._tilt_known:
+            self._tilt += self._cross_talk.add_frames(self._tilts_nm[: self._waiting], open_nm @ self._to_own.T)
+        self._changes += np.square(_changes(open_nm, self._before_nm)).sum(axis=0) / 2
+        self._changes_counted += len(open_nm) - (self._before_nm is None)
         self._before_nm = open_nm[-1:].copy()
         squares = np.square(errors_nm)
-        power = squares[:, :1].copy()
-        squares -= power
-        self._power += power[:, 0].sum(axis=0)
+        power = squares[:, 0].copy()
+        squares -= power[:, None]
+        self._power += power.sum(axis=0)
         self._mean += open_nm.sum(axis=0)
+        self._excess += squares.sum(axis=0)
         self._spread += np.square(squares).sum(axis=0)
-        self._excess[:-1] += squares.sum(axis=0)
-        self._excess[-1] += (np.square(self._loop_nm[: self._waiting]) - power[:, 0]).sum(axis=0)
         self._waiting = 0
 
     def _clear(self, window: int) -> None:
@@ -309,8 +309,7 @@ class GainBank:
 
     def _begin_block(self) -> None:
         self._frames = self._changes_counted = self._waiting = 0
-        self._excess = np.zeros((len(self.rows) + 1, self._at_rest.kept.size))  # last row: real loop
-        self._spread = np.zeros((len(self.rows), self._at_rest.kept.size))
+        self._excess, self._spread = np.zeros((2, *self._errors_nm.shape[1:]))
         self._power, self._changes, self._mean = np.zeros((3, self._at_rest.kept.size))
         self._tilt = np.zeros(_REGRESSORS)
 
@@ -346,12 +345,13 @@ class TiltCrossTalk:
         Returns:
             (regressors,) sums over the frames; `mean_nm` needs their means.
         """
-        x, y = tilt_nm.T.astype(float)
-        rows = np.column_stack([x, y, x * x, x * y, y * y, open_nm])
-        changes = np.diff(rows, axis=0, prepend=rows[:0] if self._before is None else self._before)
+        rows = np.empty((len(open_nm), _REGRESSORS + open_nm.shape[1]))
+        rows[:, :2], rows[:, _REGRESSORS:] = tilt_nm, open_nm
+        rows[:, 2:_REGRESSORS] = rows[:, [0, 0, 1]] * rows[:, [0, 1, 1]]
+        changes = _changes(rows, self._before)
         self._products += changes[:, :_REGRESSORS].T @ changes
         self._powers += np.square(changes[:, _REGRESSORS:]).sum(axis=0)
-        self._changes += len(changes)
+        self._changes += len(changes) - (self._before is None)
         self._before = rows[-1:]
         return np.asarray(rows[:, :_REGRESSORS].sum(axis=0))
 
@@ -372,6 +372,11 @@ class TiltCrossTalk:
         return squares @ slopes, np.sqrt((squares @ inverse @ squares) * unexplained)
 
 
+def _changes(rows: Array | Single, before: Array | Single | None) -> Array:
+    """Changes (rows, columns) of each row from the one before it: of the first from `before`, 0 if that is None."""
+    return np.asarray(rows - np.concatenate([rows[:1] if before is None else before, rows[:-1]]))
+
+
 def _mean(blocks: Array) -> tuple[Array, Array]:
     """Mean over the blocks (the first axis), and its standard error."""
     return blocks.mean(axis=0), blocks.std(axis=0, ddof=1) / np.sqrt(len(blocks))
@@ -381,11 +386,6 @@ def _better(blocks: Array) -> tuple[Array, Mask]:
     """Mean over the blocks, and whether it is below 0 by `CONFIDENCE` or in `WINNING_BLOCKS` blocks."""
     mean, error = _mean(blocks)
     return mean, (mean < -CONFIDENCE * error) | ((mean < 0) & (np.sum(blocks < 0, axis=0) >= WINNING_BLOCKS))
-
-
-def injected_fraction(gain: Single) -> Single:
-    """Fraction (modes,) of a frame's noise variance that an integrator puts on the mirror, for a delay of one frame."""
-    return gain / (2 - gain)
 
 
 def uncorrected_prior_nm2(verdict: Verdict, uncorrected: Mask, noise_nm2: Array) -> Single:

@@ -59,3 +59,8 @@ def integrate(integrator: Integrator, command_nm: Single, error_nm: Single) -> t
     if np.count_nonzero(np.abs(next_nm) > integrator.limit_nm):
         return np.clip(next_nm, -integrator.limit_nm, integrator.limit_nm), True
     return next_nm, False
+
+
+def injected_fraction(gain: Single) -> Single:
+    """Fraction (modes,) of a frame's noise variance that an integrator puts on the mirror, for a delay of one frame."""
+    return gain / (2 - gain)

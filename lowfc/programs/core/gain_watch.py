@@ -4,12 +4,11 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-import numpy.ma  # `np.median` would import it during the first verdict, which takes 10 ms
 
 from lowfc.arrays import Array, Mask, Single
-from lowfc.control.calibration.map_reconstructor import map_rows, noise_covariance_nm2
-from lowfc.control.laws.automatic_gain import CONFIDENCE, GainBank, Verdict, injected_fraction, uncorrected_prior_nm2
-from lowfc.control.laws.integrator import TIP_TILT
+from lowfc.control.calibration.map_reconstructor import map_rows, noise_covariance_nm2, unit_covariances_nm2
+from lowfc.control.laws.automatic_gain import BLOCKS, CONFIDENCE, GainBank, Verdict, uncorrected_prior_nm2
+from lowfc.control.laws.integrator import TIP_TILT, injected_fraction
 from lowfc.control.loop.inputs import COUNT_BITS, PendingEvent, Request, Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import ActiveLoop, Settings, State, Weighting
@@ -58,17 +57,21 @@ class _Group:
         rate_hz = settings.rate_hz or 1.0
         frames = [max(round(seconds * rate_hz), MIN_FRAMES) for seconds in (FIRST_S, window_s)]
         self.mask, self.tilt = mask, tilt
-        self.bank = GainBank(
-            loop.integrator.leak[mask],
-            loop.integrator.limit_nm[mask],
-            loop.delay_weights,
-            settings.delay_frames,
-            (frames[0], frames[1]),
-        )
+        leak, limit_nm = loop.integrator.leak[mask], loop.integrator.limit_nm[mask]
+        new_bank = partial(GainBank, leak, limit_nm, loop.delay_weights, settings.delay_frames)
+        self.bank = new_bank((frames[0], frames[1]))
         self.verdict: Verdict | None = None
         self.gain = loop.integrator.gain[mask]
         self.harmful_windows = 0
         self.cautious = window_s == OTHERS_S  # until the first verdict, see CAUTIOUS_GAIN
+        self._rehearse(new_bank((BLOCKS, BLOCKS)))
+
+    def _rehearse(self, bank: GainBank) -> None:
+        """Give a verdict with a bank that is then discarded: the first one takes twice as long, and numpy imports."""
+        nothing = np.zeros(self.gain.size, np.float32)
+        while not bank.complete:
+            bank.add_frame(nothing, nothing, None if self.tilt is None else np.zeros(2, np.float32), closed=False)
+        bank.verdict(nothing, np.ones(nothing.size))
 
 
 class GainWatch:
@@ -177,6 +180,7 @@ class GainWatch:
         if identity == self._identity:
             return
         self._identity, self._weighting = identity, None
+        unit_covariances_nm2(loop.calibration)  # computed now, not between two frames
         tilt = np.isin(loop.calibration.noll, TIP_TILT)
         tilt_of_others = tilt if tilt.sum() == len(TIP_TILT) else None
         self._groups = [
