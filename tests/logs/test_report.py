@@ -121,6 +121,15 @@ def test_without_a_count_of_late_commands_the_commands_are_not_called_in_time(tm
     assert check_of(results, "delay")["level"] == "unknown"
 
 
+@pytest.mark.parametrize(("late", "level"), [(15, "good"), (16, "look")])
+def test_more_than_one_late_command_in_twenty_needs_attention_as_in_the_view(
+    tmp_path: Path, late: int, level: str
+) -> None:
+    night = SyntheticLog().health("camera", state="ready").frames(300)
+    night.health("camera", commands_late=late, state="stopped")
+    assert check_of(results_of(night.write(tmp_path / "log.mcap")), "delay")["level"] == level
+
+
 def test_latencies_agree_with_the_times_in_the_messages(eventful: dict[str, Any]) -> None:
     latency = eventful["timing"]["latency_us"]
     assert latency["transport"] == {"count": 2244, **dict.fromkeys(("p50", "p90", "p99", "p99_9", "max"), 90.0)}

@@ -1,4 +1,4 @@
-"""What a closed loop does to the wavefront: the thresholds shared by the view, the console and the report."""
+"""What a closed loop does to the wavefront, and other thresholds shared by the view, the console and the report."""
 
 from enum import Enum, auto
 
@@ -6,6 +6,10 @@ WORSE = 1.1
 """Ratio of residual to open-loop wavefront above which a loop does harm; an rms over 1 s scatters by under 10 %."""
 GOOD_FACTOR = 2.0
 """Reduction factor of the wavefront rms that counts as good: leaked light, which scales as its square, falls to 1/4."""
+NEAR_STROKE = 0.9
+"""Fraction of the stroke above which the mirror has little reserve."""
+MANY_LATE = 0.05
+"""Fraction of late commands that a busy host may cause; above it, the delay is longer than the loop is tuned for."""
 
 
 class Correction(Enum):

@@ -5,15 +5,13 @@ from collections.abc import Mapping
 
 from lowfc.contract.messages import CALIBRATION, STEP, Role
 from lowfc.control.loop.wording import counted
-from lowfc.programs.cli.correction import Correction, correction
+from lowfc.programs.cli.correction import MANY_LATE, NEAR_STROKE, Correction, correction
 from lowfc.programs.logs.report.source import Results
 
 GOOD, LOOK, BAD, UNKNOWN = "good", "look", "bad", "unknown"
 _LEVELS = {Correction.GOOD: GOOD, Correction.LITTLE: UNKNOWN, Correction.HARM: LOOK}
 
 _MANY_WITHOUT_COMMAND = 0.01  # fraction of the frames
-_MANY_LATE = 0.01  # commands per step
-_MUCH_STROKE = 0.9  # fraction of the stroke limit
 
 
 def verdict(results: Results) -> Results:
@@ -130,7 +128,7 @@ def _delay(results: Results) -> Results:
     late, steps = frames["commands_late"], sum(results["mode_steps"].values())
     if late is None or not steps:
         return _check("delay", UNKNOWN, "this log does not show whether commands were in time")
-    if late < _MANY_LATE * steps:
+    if late <= MANY_LATE * steps:
         return _check("delay", GOOD, f"{counted(late, 'command')} late")
     how_late = "after the start of the next exposure, and acted one frame later than the law expects"
     return _check("delay", LOOK, f"{counted(late, 'command')} came {how_late}")
@@ -154,7 +152,7 @@ def _mirror(results: Results) -> Results:
     if (share := mirror["stroke_most_share"]) is None:
         return _check("mirror", UNKNOWN, "this log does not show the stroke used")
     text = f"at most {share:.1%} of the stroke used"
-    return _check("mirror", LOOK if share > _MUCH_STROKE else GOOD, text)
+    return _check("mirror", LOOK if share > NEAR_STROKE else GOOD, text)
 
 
 def _events(results: Results) -> Results:

@@ -11,7 +11,7 @@ from lowfc.adapters.logs.columns import Steps
 from lowfc.control.durations import Durations
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.wording import counted, hertz
-from lowfc.programs.cli.correction import Correction, correction
+from lowfc.programs.cli.correction import MANY_LATE, NEAR_STROKE, Correction, correction
 from lowfc.programs.cli.status import holds_shape
 from lowfc.programs.view.snapshot import LogEnd, Snapshot, Wavefronts
 from lowfc.programs.view.verdicts.camera_verdict import DIM, FEW, REFUSED
@@ -19,7 +19,7 @@ from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import PERIODS, RunState
 from lowfc.programs.view.verdicts.span_means import SpanMeans
 from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, duration, rounded, worst_of
-from lowfc.programs.view.verdicts.verdict import LIMITS, MANY_LATE, NEAR_STROKE, stroke
+from lowfc.programs.view.verdicts.verdict import LIMITS, stroke
 from lowfc.programs.view.verdicts.watcher import FRAMES_SILENT_S
 
 _MODES = {mode.value: mode for mode in LoopMode}

@@ -12,19 +12,15 @@ from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.control.loop.safety import Limit, LoopMode, Reason, Rejection, reason_name
 from lowfc.control.loop.wording import CAMERA_MISFIT, MEASURED_FIRST, counted
-from lowfc.programs.cli.correction import Correction, correction
+from lowfc.programs.cli.correction import MANY_LATE, NEAR_STROKE, Correction, correction
 from lowfc.programs.view.verdicts.camera_verdict import all_refused, frames, star
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import Liveness, RunState
 from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, absent, clock, duration, rounded, short, worst_of
 from lowfc.programs.view.verdicts.wavefront_verdict import contrast, wavefront
 
-NEAR_STROKE = 0.9
-"""Fraction of the stroke above which the mirror has little reserve."""
 LIMITED = 0.5
 """Fraction of limited commands above which the limit is not transient."""
-MANY_LATE = 0.05
-"""Fraction of late commands that a busy host may cause; above it, the delay is longer than the loop is tuned for."""
 BEHIND_S, FAR_BEHIND_S = 1.0, 5.0
 """Delay of the view for a warning, and for an alarm."""
 
