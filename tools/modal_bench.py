@@ -55,7 +55,7 @@ def _differential_calibration(noll: tuple[int, ...]) -> Calibration:
 
 
 class ModalBench(Bench):
-    """A modal loop in one process. `new_record` discards the record and begins a new one."""
+    """A modal loop in one process; it records steps and true residuals since `new_record`."""
 
     def __init__(
         self,
@@ -71,7 +71,7 @@ class ModalBench(Bench):
             config: configuration of the controller and of the simulation.
             covariance_nm2: (modes, modes) of the measurement noise.
             disturbance: replaces the configuration's.
-            watch: whether to compare gains and detect harm, which takes a third of the time.
+            watch: whether to run the gain watch, which takes a third of the time.
         """
         self._begin(config, Load(0, _differential_calibration(config.noll), "bench"))
         self.watch = GainWatch(self.settings, config.control.on_harm) if watch else None
@@ -92,7 +92,7 @@ class ModalBench(Bench):
         return Sampler(self._disturbance, instants, self.config.camera.rate_hz)
 
     def move_lines(self, factor: float) -> None:
-        """Scale the vibration frequencies from now on, continuous in phase; only at a multiple of BLOCK frames."""
+        """Scale the reaction wheel's frequencies from now on, continuous in phase, at a multiple of BLOCK frames."""
         if self._index % BLOCK:
             raise ValueError(f"lines can move only at a frame that is a multiple of {BLOCK}, not at {self._index}")
         moved = with_lines_moved(self._disturbance, factor)

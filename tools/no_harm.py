@@ -26,7 +26,7 @@ MODAL = ("sam", "sam27d10_bal14", "clowfs", "zwfs", "bar")
 IMAGED_MAGNITUDES = (2, 5, 8)
 SHOWN = (-1, *IMAGED_MAGNITUDES)
 TOLERATED = 0.01
-"""Tolerated added contrast as a fraction of the dark zone's own, in addition to three standard errors."""
+"""Tolerated added contrast as a fraction of the dark zone's own, beyond three standard errors (none for `quiet`)."""
 RATE_HZ, SECONDS = 250.0, 20.0
 GAINS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.1)
 _HALF_FRAMES = int(RATE_HZ * SECONDS / 2)

@@ -14,13 +14,13 @@ ARGUMENT_ERRORS = (ValueError, TypeError, OverflowError)
 
 
 def floats(name: str, values: npt.ArrayLike) -> Single:
-    """Values of any shape, in their unit, as float32; RequestRefusedError if some are not real numbers."""
+    """Values of any shape, in any unit, as float32; RequestRefusedError if some are not real numbers."""
     with raised_as(RequestRefusedError, ARGUMENT_ERRORS, f"{name} refused"):
         return np.asarray(real(values), np.float32)
 
 
 def real(values: npt.ArrayLike) -> npt.ArrayLike:
-    """Values of any shape, in their unit; TypeError if complex or masked: numpy would drop imaginary part or mask."""
+    """Values of any shape and unit, unchanged; TypeError if complex or masked: numpy would drop imaginary part or mask."""
     if np.iscomplexobj(values) or np.ma.is_masked(values):
         raise TypeError("expected real numbers without a mask, got complex or masked ones")
     return values

@@ -41,7 +41,7 @@ class BusError(LowfcError):
 
 
 class BadMessageError(BusError):
-    """A message from the bus cannot be read; it is counted and ignored, and the process continues."""
+    """A message from the bus cannot be read; it is reported and ignored, and the process continues."""
 
 
 class RequestRefusedError(LowfcError):

@@ -25,7 +25,7 @@ AHEAD_NS = 1_000_000_000
 
 Move = Callable[[Single, float], Single]
 """Function that drives the actuators (rows, columns), nm of surface, and returns their positions. Its second argument
-is the run's time, ns, since the previous command or, without a new one, since the last call; infinite at first."""
+is the time to settle, ns: since the previous command if a command arrives, else since the last call; first infinite."""
 
 
 @dataclass(frozen=True)

@@ -228,7 +228,7 @@ def test_the_verdict_names_what_was_wrong(eventful: dict[str, Any]) -> None:
     assert found["level"] == "look"
     assert {name for name, level in levels.items() if level == "look"} == {"commands", "light", "events"}
     assert {name for name, level in levels.items() if level == "good"} == {"log", "loop", "residual", "delay", "mirror"}
-    assert found["because"] == "6 of 2250 frames (0.27%) led to no command"
+    assert found["because"] == "6 of 2250 frames (0.27%) were not processed"
     before_nm = eventful["residual"]["open_pupil"]["disturbance_open_pupil_rms_nm"]
     text = check_of(eventful, "residual")["text"]
     assert text.startswith(f"{before_nm:.3g} nm before")

@@ -11,12 +11,12 @@ from lowfc.control.loop.camera import CameraSettings
 
 @lru_cache(maxsize=2)  # slow; automatic gains need it between two frames
 def unit_covariances_nm2(calibration: Calibration) -> tuple[Array, Array]:
-    """The result of `unit_noise_nm2` for the calibration's own R; (modes, modes) each, nm^2."""
+    """Covariances (modes, modes), nm^2, of photon noise and of read noise for the own R: see `unit_noise_nm2`."""
     return unit_noise_nm2(calibration.reconstructor.astype(np.float64), calibration.reference.astype(np.float64))
 
 
 def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: CameraSettings | None) -> Array | None:
-    """Covariance (modes, modes), nm^2, of the modes' noise in one frame, which is divided by its flux.
+    """Covariance (modes, modes), nm^2, of the noise of the modes measured from one frame divided by its flux.
 
     It includes the photon noise of a frame whose image is I0, and read noise. None if the camera's gain or the flux is
     unknown.
@@ -37,11 +37,12 @@ def map_rows(
     camera: CameraSettings | None,
     *matrices: Single,
 ) -> list[Single]:
-    """Matrices M (modes, columns), such as R, with the rows M_c - C_cu (C_uu + P_u)^-1 M_u for corrected modes c.
+    """Replace the rows M_c of the corrected modes c, in each matrix M, by M_c - C_cu (C_uu + P_u)^-1 M_u.
 
-    M_u are the rows of the uncorrected modes u; they stay as they are. P_u is the prior of these modes, and C the noise
-    covariance of the calibration's own R. If this R is the weighted one for the same flux, the new rows of R are
-    (H'WH + P^-1)^-1 H'W, with W the pixels' inverse variances, and P^-1 = 0 for the corrected modes.
+    The rows M_u of the uncorrected modes u are unchanged. M (modes, columns) is for example R; P_u is
+    the prior of these modes, and C the noise covariance of the calibration's own R. If this R is the weighted one for
+    the same flux, the new rows of R are (H'WH + P^-1)^-1 H'W, with W the pixels' inverse variances, and
+    P^-1 = 0 for the corrected modes.
 
     Args:
         calibration: The calibration in use.

@@ -15,7 +15,7 @@ from lowfc.control.loop.state import ActiveLoop, Settings, State
 from lowfc.control.loop.wording import CAMERA_MISFIT, MEASURED_FIRST
 
 ADOPTED_NM = 1.0
-"""Deviation of an actuator from the modal command above which a mirror's shape is adopted as a channel, nm."""
+"""Largest deviation from the modal command's shape that is ignored, nm of surface; a larger one becomes a channel."""
 REFUSED_IN_A_ROW = 3
 """A closed loop counts as holding its command once this number of frames in a row is refused."""
 LATCHED = "it was in safe mode before the controller started"
@@ -25,7 +25,7 @@ MIRROR_WAS_SAFE = "the mirror's last command was sent in safe mode"
 def loaded(
     settings: Settings, state: State, calibration: Calibration, source: str, time_ns: int
 ) -> tuple[State, list[PendingEvent]]:
-    """The state with another calibration, and the events other than those of a change of the loop mode.
+    """The state with another calibration, and its events without those of the loop mode, which the caller adds.
 
     If the mirror has the same grid, it keeps its shape: the channels stay, the rest becomes a command of the new modes,
     and the part outside the modes becomes a channel (not in safe mode). A probe sequence ends, and the next command
@@ -250,7 +250,10 @@ def end_probe(loop: ActiveLoop, sequence: int, why: str, events: list[PendingEve
 
 
 def camera_reported(settings: Settings, state: State, camera: CameraSettings) -> tuple[State, Outputs]:
-    """Store the camera's settings; open a closed loop if they do not fit. Idle while `uncalibrated_cause` has one."""
+    """Store the camera's settings; open a closed loop if they do not fit.
+
+    Before the first used frame, the loop is idle while `uncalibrated_cause` gives a cause.
+    """
     after = _with_camera(state, camera)
     if after is state:
         return state, Outputs()
@@ -281,7 +284,7 @@ def _with_camera(state: State, camera: CameraSettings) -> State:
 
 
 def adopted(loop: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[PendingEvent]]:
-    """Adopt as a channel what the modal command does not explain of a shape (rows, columns), unless only rounding."""
+    """Adopt as a channel the part of a shape (rows, columns) that the modal command does not make, unless tiny."""
     deviation_nm = shape_nm.copy()
     deviation_nm -= (loop.to_actuators @ loop.history_nm[0]).reshape(deviation_nm.shape)
     if not np.abs(deviation_nm).max() > ADOPTED_NM:

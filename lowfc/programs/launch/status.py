@@ -80,7 +80,10 @@ def _rate(measured: str, rate_hz: float, lockstep_hz: float | None) -> str:
 
 
 def _closed_for(controller: wire.Health, rate_hz: float) -> str:
-    """Text of the total time closed, if the loop is closed and this time is shorter than `_RECENT_S`; else empty."""
+    """Text of the total time closed, if the loop is closed and this time is shorter than `_RECENT_S`; else empty.
+
+    The recent statistics then include frames before the closing.
+    """
     frames = topic_count(controller, FRAME.key).received
     closed_s = frames / rate_hz - controller.not_closed_ns * 1e-9 if rate_hz else 0.0
     just_closed = controller.mode == wire.LOOP_MODE_CLOSED and 0 < closed_s < _RECENT_S

@@ -69,7 +69,7 @@ def _highest_dn(state: wire.CameraState) -> float:
     return 2.0 ** min(state.bit_depth, _MAX_BITS) - 1
 
 
-@SETTINGS.check("settings kept", "constant: a change opens the loop")
+@SETTINGS.check("settings kept", "constant: a change of size, region, bias, saturation or gain opens the loop")
 def _kept(camera: Camera) -> Check | None:
     states = [state for state in camera.states if state is not None]
     if not states:
@@ -164,7 +164,7 @@ AGREEMENTS = (
     Agreement("gain_e_per_dn", "camera.gain_e_per_dn", "e-/DN", 0.02, True, _WEIGHTS),
     Agreement("em_gain", "camera.em_gain", "", 0.02, True, _WEIGHTS),
     Agreement("read_noise_e", "camera.read_noise_e", "e-", 0.2, True, _WEIGHTS),
-    Agreement("exposure_ns", "camera.exposure_fraction", "ms", 0.05, False, "the light of a computed calibration"),
+    Agreement("exposure_ns", "camera.exposure_fraction", "ms", 0.05, False, "the flux of a computed calibration"),
     Agreement("bit_depth", "camera.bit_depth", "bits", 0.0, False, _SATURATED),
     Agreement("saturation_dn", "camera.full_well_e", "DN", 0.01, False, _SATURATED),
 )

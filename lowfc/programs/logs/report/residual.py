@@ -21,7 +21,8 @@ def residual_results(run: Run, stretch: Stretch | None) -> Results:
     """Rms in nm of each mode and signal, and of tip and tilt per axis in mas; None for signals not in the log.
 
     Closed-loop values are over the longest stretch under one law, after settling; open-loop values are over all
-    open-loop steps under the last calibration.
+    open-loop steps under the last calibration. Without a closed stretch, the disturbance over the open pupil and the
+    added contrast are over the open-loop steps.
     """
     history = run.history
     steps = history.steps

@@ -62,10 +62,10 @@ def percentiles_us(durations_ns: Long) -> Results:
 def frame_counts(history: History) -> Results:
     """Frames in the log, frames without a step (and thus without a command), and counts of camera and controller.
 
-    Every frame that the controller takes leads to a step and, with a calibration, usually to a command; frames that it
-    skipped (too many waited) or missed (never arrived) have neither. The last frames, whose commands may be after the
-    end of the log, are counted separately. The controller's own counts begin at its start, which may be before the
-    start of the log. Only the simulated camera counts late commands.
+    Every frame that the controller processes leads to a step and, with a calibration, usually to a command; frames
+    that it skipped (too many waited) or missed (never arrived) have neither. The last frames, whose commands may be
+    after the end of the log, are counted separately. The controller's own counts begin at its start, which may
+    be before the start of the log. Only the simulated camera counts late commands.
     """
     frames, rows = np.unique(history.frame_sequence, return_index=True)
     without_step = rows_of(frames, history.stepped_sequence) < 0

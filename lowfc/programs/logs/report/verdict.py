@@ -117,9 +117,9 @@ def _commands(results: Results) -> Results:
             return _check("commands", UNKNOWN, "this log has no calibration, without which its steps cannot be read")
         return _check("commands", UNKNOWN, "this log has no calibration, without which frames lead to no command")
     if not without:
-        return _check("commands", GOOD, f"all {recorded} frames led to a command")
+        return _check("commands", GOOD, f"all {recorded} frames were processed")
     share = without / recorded
-    text = f"{without} of {recorded} frames ({share:.2%}) led to no command"
+    text = f"{without} of {recorded} frames ({share:.2%}) were not processed"
     return _check("commands", BAD if share >= _MANY_WITHOUT_COMMAND else LOOK, text)
 
 

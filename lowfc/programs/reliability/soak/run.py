@@ -43,7 +43,7 @@ class LogChecker:
 
     @property
     def gaps(self) -> int:
-        """Messages missing in the logs between others of one publisher, on topics whose messages are all recorded."""
+        """Messages missing from the logs: gaps in each publisher's counts, on topics that are recorded in full."""
         received = self._received.items()
         return sum(gaps.missing for (key, _), gaps in received if self._selection.records_all(topic_of(key)))
 
