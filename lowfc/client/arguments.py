@@ -20,7 +20,7 @@ def floats(name: str, values: npt.ArrayLike) -> Single:
 
 
 def real(values: npt.ArrayLike) -> npt.ArrayLike:
-    """Values of any shape and unit, unchanged; TypeError if complex or masked: numpy would drop imaginary part or mask."""
+    """Values of any shape, in any unit; TypeError if complex or masked: numpy would drop imaginary part or mask."""
     if np.iscomplexobj(values) or np.ma.is_masked(values):
         raise TypeError("expected real numbers without a mask, got complex or masked ones")
     return values
