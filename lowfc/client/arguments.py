@@ -26,8 +26,8 @@ def real(values: npt.ArrayLike) -> npt.ArrayLike:
     return values
 
 
-def required(name: str, value: object, kind: type[T]) -> T:
+def checked_type(name: str, value: object, kind: type[T]) -> T:
     """Return `value`, an argument of a request; RequestRefusedError if its type is not `kind`."""
     if not isinstance(value, kind):
-        raise RequestRefusedError(f"{name} refused: it takes a {kind.__name__}, got {brief(value)}")
+        raise RequestRefusedError(f"{name} refused: expected {kind.__name__}, got {brief(value)}")
     return value

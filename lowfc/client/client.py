@@ -22,7 +22,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.host import by_this_process, program_name
 from lowfc.arrays import Single
 from lowfc.client.answer import Answer
-from lowfc.client.arguments import ARGUMENT_ERRORS, floats, real, required
+from lowfc.client.arguments import ARGUMENT_ERRORS, checked_type, floats, real
 from lowfc.client.bench import bench_message
 from lowfc.client.lease import Lease, new_identity
 from lowfc.client.mirror_watch import MirrorWatch
@@ -348,16 +348,16 @@ class Client:
                 name=name,
                 modes=[index(mode) for mode in np.atleast_1d(modes).tolist()] if np.size(modes) else [],
                 values=np.atleast_1d(np.asarray(real(values), np.float64)).tolist(),
-                text=required(name, text, str),
+                text=checked_type(name, text, str),
                 actuators=b"" if actuators_nm is None else actuators_nm.tobytes(),
                 table=b"" if table is None else table.tobytes(),
                 columns=0 if table is None else table.shape[1],
-                law=None if law is None else wire_law(required(name, law, LinearLaw)),
+                law=None if law is None else wire_law(checked_type(name, law, LinearLaw)),
                 lease_id=(self._lease.id if self._lease is not None else 0) if lease_id is None else lease_id,
                 requester=self._requester,
             )
         if calibration is not None:
-            message.calibration.MergeFromString(encode_calibration(required(name, calibration, Calibration), 0))
+            message.calibration.MergeFromString(encode_calibration(checked_type(name, calibration, Calibration), 0))
         payload = message.SerializeToString()
         if len(payload) > max_bytes(name):
             remedy = ": send it in parts" if name in ("play", "note") else ""

@@ -18,7 +18,7 @@ PATIENCE_S = 1.0
 """Timeout of an exposure, or three periods if that is longer."""
 REST_NS = 100_000_000
 """Longest sleep between two heartbeats of the process (`beat`) while a failed driver is not called."""
-AHEAD_NS = 5_000_000
+MAX_END_AHEAD_NS = 5_000_000
 """Largest time by which the stated end of an exposure may be ahead of the present time of its clock."""
 MAX_LOST_FRAMES, MAX_RATE_RATIO = 100, 4
 """Largest plausible step of frame numbers: MAX_LOST_FRAMES + MAX_RATE_RATIO x periods since the last frame. A
@@ -127,7 +127,7 @@ class CameraLoop:
     def _end_ns(self, exposure: Exposure, settings: CameraSettings) -> int:
         """End of an exposure by the run's clock.
 
-        ValueError if the driver's time is more than `AHEAD_NS` in the future, or before 1970, unless it is simulated.
+        ValueError if the driver's time is over `MAX_END_AHEAD_NS` ahead, or before 1970, unless it is simulated.
         """
         clock = self._service.clock
         if exposure.end_ns is None:
@@ -137,8 +137,8 @@ class CameraLoop:
             return end_ns
         end_ns += clock.offset_ns if settings.clock == "monotonic" else clock.ahead_ns()
         ahead_ns = end_ns - clock.host_ns()
-        if ahead_ns > AHEAD_NS or end_ns < 0:
-            expected = f"expected at most {AHEAD_NS * 1e-9:g} s, and a time after 1970"
+        if ahead_ns > MAX_END_AHEAD_NS or end_ns < 0:
+            expected = f"expected at most {MAX_END_AHEAD_NS * 1e-9:g} s, and a time after 1970"
             raise ValueError(f"end_ns is {ahead_ns * 1e-9:.3f} s ahead of the {settings.clock} clock, {expected}")
         return end_ns
 

@@ -19,7 +19,7 @@ _NONE: Single = np.zeros(0, np.float32)
 
 MAX_VALID_NS = 2_000_000_000
 """Longest time for which a command may be held; a longer `valid_for_ns` is shortened to it."""
-AHEAD_NS = 1_000_000_000
+MAX_FRAME_AHEAD_NS = 1_000_000_000
 """Largest time by which a frame's time may be ahead of the mirror's clock; beyond it, `tick` uses only that clock."""
 
 
@@ -165,7 +165,7 @@ def tick(protection: MirrorProtection, status: Status, now_ns: int, move: Move) 
     if not status.following and protection.flatten and status.driven_nm.any():
         flat = limit(protection.tightened_limits, status.driven_nm, np.zeros(protection.grid, np.float32)).actuators_nm
         status = status._replace(driven_nm=flat, limits_hit=(), command_nm=_NONE, channels={})
-    has_time = status.time_ns and status.time_ns - now_ns < AHEAD_NS
+    has_time = status.time_ns and status.time_ns - now_ns < MAX_FRAME_AHEAD_NS
     time_ns = max(now_ns, status.time_ns) if has_time else now_ns
     elapsed_ns = time_ns - status.time_ns if has_time else np.inf
     return status._replace(surface_nm=move(status.driven_nm, elapsed_ns), time_ns=time_ns)

@@ -15,6 +15,7 @@ from lowfc.contract.codecs.calibration_codec import with_identity
 from lowfc.contract.configuration import FIXED_GAINS
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import REQUEST, wire
+from lowfc.control.calibration.linearity import Gains
 from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.programs.commissioning.acceptance import capture, linearity, noise, rejection
@@ -165,6 +166,8 @@ def test_the_linearity_test_passes_the_simulated_sensor_and_fails_noise_or_a_hal
     assert [row.amplitude_nm for row in mode.levels] == pytest.approx([6, 12, 24])
     noise_nm = np.random.default_rng(8).normal(0.0, 50.0, response.error_nm.shape)
     assert linearity.judge([replace(response, error_nm=response.error_nm + noise_nm)], loop.config).modes[0].too_noisy
+    one_cycle = Gains(np.array([6.0]), np.array([[1.0, 0.0]]), np.full((1, 2), np.nan), mode=0)
+    assert one_cycle.within(0.1, 0.1) == [None], "without a standard error, nobody can tell"
     # Of repeated tests, the last one counts.
     halved = linearity.judge([response, replace(response, error_nm=0.5 * response.error_nm)], loop.config)
     assert [mode.passed for mode in halved.modes] == [False]

@@ -113,9 +113,9 @@ def test_summary_and_status_show_the_time_not_closed() -> None:
     assert first_line(mode=wire.LOOP_MODE_OPEN, **not_closed) == expected.replace("closed;", "open;")
     assert first_line(mode=wire.LOOP_MODE_SAFE, **not_closed) == expected.replace("closed;", "in safe mode;")
     not_closed["not_closed_ns"] = 10 * SECOND_NS
-    expected = "; not closed during the run: the camera does not fit"
-    assert first_line(mode=wire.LOOP_MODE_OPEN, **not_closed) == f"open{expected}"
-    assert first_line(mode=wire.LOOP_MODE_CLOSED, **not_closed) == f"closed at the end{expected}"
+    assert first_line(mode=wire.LOOP_MODE_OPEN, **not_closed) == "open; never closed: the camera does not fit"
+    expected = "closed only at the end: the camera does not fit"
+    assert first_line(mode=wire.LOOP_MODE_CLOSED, **not_closed) == expected
     short = first_line(mode=wire.LOOP_MODE_CLOSED, not_closed_ns=SECOND_NS // 25)
     assert short == "closed; not closed for 0.04 s in total"
     assert screen(Watch({}, [Log(message="without a level")]), Configuration(), None, 1.0), "shown without an error"
@@ -254,6 +254,7 @@ def test_the_status_line_shows_recent_statistics_and_none_before_the_first_frame
     assert "residual 2.20 of 30.00 nm rms" in console.export_text()
     for health, seconds in ((watch.health["camera"], 10), (watch.health["controller"], 17)):
         health.timestamp.FromSeconds(seconds)
+    watch.health["controller"].frame_to_command.CopyFrom(wire.Latency(count=9, p50_ns=123_000))
     assert status_line(watch, 17.0) == "   17 s  closed  the camera has been silent for 7 s"
     hung = Watch(watch.health | {"controller": wire.Health(process="controller")}, [])
     assert status_line(hung, 17.0).endswith("the controller has been silent for 10 s")
@@ -262,6 +263,7 @@ def test_the_status_line_shows_recent_statistics_and_none_before_the_first_frame
         console.print(screen(watch, load(None, {"sensor.kind": "zwfs"}), None, 17.0))
     shown = console.export_text()
     assert "2.20" not in shown, "statistics seven seconds old are not shown"
+    assert "123 us" not in shown
     assert "bench, V = 2, zwfs; 17 s" in shown
     assert "closed (not correcting: reserved for [/b])" in shown, "an operator's text is not interpreted as markup"
 

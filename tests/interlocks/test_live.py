@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.client import Client, running
+from lowfc.client import Client
 from lowfc.contract.errors import BusError, RequestRefusedError
 from lowfc.contract.messages import BENCH, CONTROL_INPUT, FRAME, STEP, wire
 from tests.support.loops import FIXED, interrupt, output_of, started, until
@@ -45,6 +45,7 @@ def test_interlocks_act_on_values_within_a_period_and_a_flood_of_values_loses_no
     (tmp_path / "night.toml").write_text(CONFIG)
     options = ("--json", "--config", "night.toml", "--run", RUN, "--duration", "600")
     with started(tmp_path, "sim-loop", *options) as process:
+        until(lambda: any(tmp_path.glob("logs/*.mcap.part")), 60)  # a replay needs every request since the last state
         _publish()
         out, stderr = interrupt(process)
     assert process.returncode == 0, stderr
@@ -61,7 +62,6 @@ def test_interlocks_act_on_values_within_a_period_and_a_flood_of_values_loses_no
 
 def _publish() -> None:
     """Publish values at random times, then a flood of them, then none."""
-    until(lambda: RUN in running(), 60)
     rng = random.Random(3)  # noqa: S311
     with Client(RUN) as loop:
         until(lambda: _has_frames(loop), 60)

@@ -48,9 +48,9 @@ class Gains:
         own = np.arange(self.gain.shape[1]) == self.mode
         limit = np.where(own, gain_error, crosstalk)
         beyond = np.abs(self.gain - own) > limit + SIGMAS * self.error
-        unsure = self.error > limit / 2
-        rows = zip(beyond, unsure, strict=True)
-        return [False if is_beyond.any() else None if is_unsure.any() else True for is_beyond, is_unsure in rows]
+        sure = self.error <= limit / 2  # false for the NaN of a single cycle
+        rows = zip(beyond, sure, strict=True)
+        return [False if is_beyond.any() else True if is_sure.all() else None for is_beyond, is_sure in rows]
 
 
 def gains(error_nm: Array, mode: int, levels_nm: Array, starts: Integers, frames: int) -> Gains:

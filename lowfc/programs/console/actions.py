@@ -111,7 +111,7 @@ def request_action(key: str, name: str, confirm: str = "") -> Action:
     declared = BY_NAME[name]
 
     def ask(loop: Client, values: Values) -> Answer:
-        if name == "gain" and values["values"] == AUTO:
+        if name == "gain" and values["values"].strip() == AUTO:
             return loop.automatic_gain(_modes(values["modes"]))
         arguments = {_READERS[field][0]: _READERS[field][1](text) for field, text in values.items()}
         if name == "channel":  # this method of the client checks the shape against the mirror's grid

@@ -40,8 +40,8 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     rate = silent or _rate(measured, camera.rate_hz, config.lockstep_hz)
     table.add_row("loop", Text(f"{mode(controller)}, {rate}"))  # rich would read a string as markup
     table.add_row("wavefront", silent or _wavefront_in_words(camera))
-    table.add_row("frame to command", latency(controller.frame_to_command))
-    table.add_row("frame to mirror", latency(camera.frame_to_mirror))
+    table.add_row("frame to command", "-" if silent else latency(controller.frame_to_command))
+    table.add_row("frame to mirror", "-" if silent else latency(camera.frame_to_mirror))
     table.add_row("frames", f"{frames.received} received, {frames.skipped} skipped, {frames.missing} missing")
     table.add_row("mirror", Text(f"{printable(mirror.state) or 'starting'}, {counted(commands.received, 'command')}"))
     table.add_row("recorder", recording(recorder))
@@ -138,7 +138,7 @@ def _loop_in_words(results: dict[str, Any]) -> str:
         case "closed" if not results["not_closed_s"]:
             return "closed"
         case mode if not results["closed_fraction"]:
-            return f"{'closed at the end' if mode == 'closed' else mode_word(mode)}; not closed during the run{cause}"
+            return f"closed only at the end{cause}" if mode == "closed" else f"{mode_word(mode)}; never closed{cause}"
         case mode:
             seconds = results["not_closed_s"]
             return f"{mode_word(mode)}; not closed for {seconds:{'.1f' if seconds >= 1 else '.2g'}} s in total{cause}"

@@ -15,7 +15,7 @@ from lowfc.programs.commissioning.conformance.connection import NS_PER_S, Collec
 LATE_NS = 20_000_000
 """Clock difference above which, by default, every frame of a camera of 100 Hz or more is refused as late."""
 
-_AHEAD_NS = 1_000_000  # largest time by which a message may seem to arrive before it was published
+_MAX_EARLY_NS = 1_000_000  # largest time by which a message may seem to arrive before it was published
 _DECADE_S = 10 * 365 * 86_400
 _UNITS = {"microseconds": 1_000, "milliseconds": 1_000_000, "seconds": NS_PER_S}
 
@@ -73,7 +73,7 @@ def _publish_time(device: CollectedMessages) -> Check | None:
         return None
     arrivals = [message.receive_time_ns for message in device.published]
     lag_ns = int(np.median([arrival - time for arrival, time in zip(arrivals, times, strict=True)]))
-    if not -_AHEAD_NS <= lag_ns <= LATE_NS:
+    if not -_MAX_EARLY_NS <= lag_ns <= LATE_NS:
         side = "before" if lag_ns > 0 else "after"
         got = f"{abs(lag_ns) / 1e6:.3g} ms {side} the arrival" if abs(lag_ns) < 3600 * NS_PER_S else f"{times[-1]} ns"
         return wrong(got, _clock_advice(times[-1], arrivals[-1], device.connection.offset_ns))

@@ -168,7 +168,7 @@ AGREEMENTS = (
     Agreement("bit_depth", "camera.bit_depth", "bits", 0.0, False, _SATURATED),
     Agreement("saturation_dn", "camera.full_well_e", "DN", 0.01, False, _SATURATED),
 )
-PERIODS_OF_TIMEOUT = 1.5
+_MIN_TIMEOUT_PERIODS = 1.5
 """Smallest `control.frame_timeout_ms`, in frame periods; a shorter timeout may act although no frame is missing."""
 
 
@@ -187,7 +187,7 @@ def agreement_checks(config: Configuration, state: wire.CameraState) -> Iterator
         advice = f"set {agreement.key}, or the camera; it is used for: {agreement.used_for}"
         yield judged(f"{field} and {agreement.key}", expected, agree, got, advice, severity=severity)
     frame_timeout_ms, period_ms = config.frame_timeout_ns * 1e-6, state.period_ns * 1e-6
-    enough, got = frame_timeout_ms >= PERIODS_OF_TIMEOUT * period_ms, f"{frame_timeout_ms:g} ms"
-    expected = f"at least {PERIODS_OF_TIMEOUT:g} frame periods of {period_ms:g} ms"
+    enough, got = frame_timeout_ms >= _MIN_TIMEOUT_PERIODS * period_ms, f"{frame_timeout_ms:g} ms"
+    expected = f"at least {_MIN_TIMEOUT_PERIODS:g} frame periods of {period_ms:g} ms"
     advice = "omit the key: its default follows camera.rate_hz"
     yield judged("control.frame_timeout_ms", expected, enough, got, advice)
